@@ -1,0 +1,88 @@
+"""Derived arrays on disk: keyed by content, written atomically, safe to delete at any time."""
+
+from __future__ import annotations
+
+import hashlib
+import logging
+import os
+import tempfile
+import zipfile
+from collections.abc import Callable, Mapping
+from pathlib import Path
+
+import numpy as np
+
+from soma_core.paths import cache_dir
+
+__all__ = ["atomic_write", "cached_arrays", "content_key", "file_sha256"]
+
+_log = logging.getLogger(__name__)
+
+
+def file_sha256(path: Path) -> str:
+    """SHA-256 of a file's bytes, as 64 hex digits."""
+    digest = hashlib.sha256()
+    with open(path, "rb") as stream:
+        for block in iter(lambda: stream.read(1 << 20), b""):
+            digest.update(block)
+    return digest.hexdigest()
+
+
+def content_key(*parts: object) -> str:
+    """One key for arrays, texts and numbers: equal content gives an equal key (32 hex digits)."""
+    digest = hashlib.sha256()
+    for part in parts:
+        if isinstance(part, np.ndarray):
+            array = np.ascontiguousarray(part)
+            digest.update(f"{array.dtype.str}{array.shape}".encode())
+            digest.update(array.data)
+        elif isinstance(part, bytes):
+            digest.update(b"b" + part)
+        else:
+            digest.update(f"{type(part).__name__}:{part}".encode())
+        digest.update(b"\0")
+    return digest.hexdigest()[:32]
+
+
+def atomic_write(path: Path, write: Callable[[Path], None]) -> None:
+    """Let `write` fill a temporary file beside `path`, then rename it: readers never see half a file."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.stem}-", suffix=path.suffix)
+    os.close(handle)
+    temporary = Path(name)
+    try:
+        write(temporary)
+        temporary.chmod(0o644)
+        temporary.replace(path)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def _read(path: Path) -> dict[str, np.ndarray] | None:
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            return {name: file[name] for name in file.files}
+    except FileNotFoundError:
+        return None
+    except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
+        _log.warning("cache file %s is unreadable (%s); building it again", path, error)
+        return None
+
+
+def cached_arrays(
+    kind: str, key: str, build: Callable[[], Mapping[str, np.ndarray]]
+) -> dict[str, np.ndarray]:
+    """Return the arrays stored under `kind`/`key`, building and storing them when absent.
+
+    A cache that cannot be written (read-only home, full disk) costs time, never the result.
+    """
+    path = cache_dir() / kind / f"{key}.npz"
+    found = _read(path)
+    if found is not None:
+        return found
+    arrays = {name: np.asarray(value) for name, value in build().items()}
+    try:
+        atomic_write(path, lambda temporary: np.savez(temporary, **arrays))
+    except OSError as error:
+        _log.warning("cannot write the cache file %s (%s); continuing without it", path, error)
+    return arrays

@@ -1,0 +1,31 @@
+"""Errors of the public boundary: each names what was wrong and how to mend it."""
+
+from __future__ import annotations
+
+__all__ = ["AssetError", "InputError", "SomaError"]
+
+
+class SomaError(Exception):
+    """Base of every error that SOMA Core raises on purpose."""
+
+
+class InputError(SomaError, ValueError):
+    """An argument was refused.
+
+    The text reads ``<argument>: got <got>, expected <expected>. <fix>``.
+    """
+
+    def __init__(self, argument: str, *, got: object, expected: object, fix: str) -> None:
+        self.argument, self.got, self.expected, self.fix = argument, got, expected, fix
+        super().__init__(f"{argument}: got {got}, expected {expected}. {fix}")
+
+
+class AssetError(SomaError):
+    """A file that SOMA Core needs is missing, damaged or of another revision.
+
+    The text reads ``<path>: <cause>. <fix>``.
+    """
+
+    def __init__(self, path: object, *, cause: str, fix: str) -> None:
+        self.path, self.cause, self.fix = str(path), cause, fix
+        super().__init__(f"{path}: {cause}. {fix}")

@@ -1,0 +1,36 @@
+"""Where the shipped assets, the hydra configs and the user's cache live."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+__all__ = ["assets_dir", "cache_dir", "configs_dir"]
+
+_PACKAGE = Path(__file__).resolve().parent
+
+
+def _shipped(name: str) -> Path:
+    """Folder `name` inside the installed wheel, or beside the package in a source checkout."""
+    inside = _PACKAGE / name
+    return inside if inside.is_dir() else _PACKAGE.parent / name
+
+
+def assets_dir() -> Path:
+    """Folder of the canonical assets; the environment variable SOMA_ASSETS overrides it."""
+    override = os.environ.get("SOMA_ASSETS")
+    return Path(override).expanduser() if override else _shipped("assets")
+
+
+def configs_dir() -> Path:
+    """Folder of the hydra configs that the core ships."""
+    return _shipped("configs")
+
+
+def cache_dir() -> Path:
+    """Folder for derived data: SOMA_CACHE_DIR, else XDG_CACHE_HOME/soma_core, else ~/.cache/soma_core."""
+    override = os.environ.get("SOMA_CACHE_DIR")
+    if override:
+        return Path(override).expanduser()
+    base = os.environ.get("XDG_CACHE_HOME")
+    return (Path(base) if base else Path.home() / ".cache") / "soma_core"

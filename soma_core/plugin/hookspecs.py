@@ -1,0 +1,33 @@
+"""The pluggy hooks of a SOMA backend plugin."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+import pluggy
+
+from soma_core.plugin.spec import BackendSpec, Generator
+
+if TYPE_CHECKING:
+    import torch
+
+__all__ = ["ENTRY_POINT_GROUP", "PROJECT", "hookimpl", "hookspec", "soma_backend", "soma_generator"]
+
+PROJECT = "soma"
+ENTRY_POINT_GROUP = "soma_core.backends"
+
+hookspec = pluggy.HookspecMarker(PROJECT)
+hookimpl = pluggy.HookimplMarker(PROJECT)
+
+
+@hookspec(firstresult=True)
+def soma_backend() -> BackendSpec:  # type: ignore[empty-body]
+    """Declare the backend. Imports neither torch nor the native model."""
+
+
+@hookspec(firstresult=True)
+def soma_generator(
+    spec: BackendSpec, device: torch.device, dtype: torch.dtype, options: Mapping[str, Any]
+) -> Generator:  # type: ignore[empty-body]
+    """Build the native generator on `device` with floating type `dtype`."""

@@ -1,0 +1,159 @@
+"""What a backend is: the declaration a plugin returns and the generator it builds (paper, section 3.2)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal, Protocol, runtime_checkable
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+__all__ = [
+    "API_VERSION",
+    "Axis",
+    "BackendSpec",
+    "FileNeeded",
+    "Generator",
+    "HasLinearBasis",
+    "HasPosed",
+    "LinearBasis",
+    "Parameter",
+    "Unit",
+    "WrapPair",
+]
+
+API_VERSION = 1
+"""Version of the plugin contract that this core speaks."""
+
+Unit = Literal["m", "cm", "mm"]
+Axis = Literal["+x", "-x", "+y", "-y", "+z", "-z"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Parameter:
+    """One named identity parameter of a backend.
+
+    Attributes:
+        name: key in ``params`` and in ``backend.params.<name>`` on the command line.
+        shape: shape of one sample; ``()`` for a scalar, ``(128,)`` for a coefficient vector.
+            A shorter vector is padded with the default.
+        default: value of every entry that the caller leaves out.
+        range: useful range (low, high); sampling stays inside, values outside are allowed.
+        group: optional heading under which listings show it.
+        description: one line for people.
+    """
+
+    name: str
+    shape: tuple[int, ...] = ()
+    default: float = 0.0
+    range: tuple[float, float] = (-3.0, 3.0)
+    group: str = ""
+    description: str = ""
+
+
+@dataclass(frozen=True, kw_only=True)
+class WrapPair:
+    """The two OBJ files that tie a native topology to the canonical one (paper, section 3.3).
+
+    Attributes:
+        native: the backend's neutral mesh, native vertex order, unit and axes.
+        wrap: the canonical mesh lying on that surface, in canonical vertex order.
+    """
+
+    native: Path
+    wrap: Path
+
+
+@dataclass(frozen=True, kw_only=True)
+class FileNeeded:
+    """A file that the user must supply, where it is looked for and where it comes from."""
+
+    path: Path
+    description: str
+    url: str = ""
+
+
+@dataclass(frozen=True, kw_only=True)
+class BackendSpec:
+    """Declaration of an identity backend; made without importing torch or the native model.
+
+    Attributes:
+        name: entry-point name, ``backend=<name>`` and ``configs/backend/<name>.yaml``.
+        api: version of the contract the plugin was written for.
+        unit: unit of the generator's vertices and of the wrap pair.
+        up, forward: the generator's axes. The body's left is ``up x forward``.
+        wrap: the OBJ pair in the generator's unit; ``None`` when the native topology is the
+            canonical one.
+        wrap_up, wrap_forward: axes of the OBJ pair where they differ from the generator's.
+        params: the identity parameters, in the order listings show them.
+        fill_segments: canonical segments without a counterpart on the native surface.
+        files: files that the user must supply.
+        options: optional dataclass type of ``backend.options``; the core validates against it.
+        licence: SPDX id or short text of the *model's* licence.
+        url: where the model comes from.
+        description: one line for ``soma backends``.
+    """
+
+    name: str
+    unit: Unit
+    up: Axis
+    forward: Axis
+    params: tuple[Parameter, ...]
+    wrap: WrapPair | None
+    api: int = API_VERSION
+    wrap_up: Axis | None = None
+    wrap_forward: Axis | None = None
+    fill_segments: tuple[str, ...] = ()
+    files: tuple[FileNeeded, ...] = ()
+    options: type | None = None
+    licence: str = ""
+    url: str = ""
+    description: str = ""
+
+
+@runtime_checkable
+class Generator(Protocol):
+    """The native model: parameters in, rest mesh out."""
+
+    def rest(self, params: Mapping[str, Tensor]) -> Tensor:
+        """Rest vertices (batch, n, 3) in the native unit, topology and axes.
+
+        ``params`` holds every declared parameter, shape (batch, *parameter.shape), on the device
+        and in the dtype the generator was built for. Differentiable where the model is.
+        """
+        ...
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class LinearBasis:
+    """A rest shape that is linear in its coefficients: ``template + coefficients @ basis``.
+
+    Attributes:
+        template: (n, 3) native unit and axes.
+        basis: (k, n, 3) native unit and axes.
+        coefficients: maps the params of :meth:`Generator.rest` to (batch, k).
+    """
+
+    template: Tensor
+    basis: Tensor
+    coefficients: Callable[[Mapping[str, Tensor]], Tensor]
+
+
+@runtime_checkable
+class HasLinearBasis(Protocol):
+    """Optional capability: lets the core compose transfer and skeleton fit once."""
+
+    def linear_basis(self) -> LinearBasis:
+        """The template, the basis and the function from parameters to coefficients."""
+        ...
+
+
+@runtime_checkable
+class HasPosed(Protocol):
+    """Optional capability: the model's own posed mesh."""
+
+    def posed(self, params: Mapping[str, Tensor], pose: Any) -> Tensor:
+        """Posed vertices (batch, n, 3) in the native unit, topology and axes."""
+        ...
