@@ -1,0 +1,108 @@
+"""Forward kinematics in the frame of the T-pose (paper, section 3.5.1)."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from soma_core.rig.skeleton import Rig
+
+__all__ = ["Kinematics", "absolute_from_relative", "joint_levels", "relative_from_absolute", "to_homogeneous"]
+
+
+def joint_levels(parents: np.ndarray) -> list[np.ndarray]:
+    """Joint ids by depth below the root, root left out; every parent lies on the level before."""
+    depth = np.zeros(len(parents), int)
+    for joint, parent in enumerate(parents):
+        depth[joint] = 0 if parent < 0 else depth[parent] + 1
+    return [np.flatnonzero(depth == level) for level in range(1, depth.max() + 1)]
+
+
+def relative_from_absolute(absolute: Tensor, orient: Tensor, parent_orient: Tensor) -> Tensor:
+    """``R_j = O_p A_j O_j^T``: local rotations of the rig's own axes to T-pose-relative ones.
+
+    Args:
+        absolute: (..., J - 1, 3, 3) local rotations A of the user joints.
+        orient, parent_orient: (J - 1, 3, 3) T-pose world rotations of each joint and of its parent.
+    """
+    return parent_orient @ absolute @ orient.transpose(-1, -2)
+
+
+def absolute_from_relative(relative: Tensor, orient: Tensor, parent_orient: Tensor) -> Tensor:
+    """``A_j = O_p^T R_j O_j``, the inverse of :func:`relative_from_absolute`."""
+    return parent_orient.transpose(-1, -2) @ relative @ orient
+
+
+def to_homogeneous(rotations: Tensor, positions: Tensor) -> Tensor:
+    """Transforms (..., 4, 4) from rotations (..., 3, 3) and positions (..., 3)."""
+    top = torch.cat((rotations, positions[..., None]), -1)
+    bottom = top.new_zeros(*top.shape[:-2], 1, 4)
+    bottom[..., 3] = 1
+    return torch.cat((top, bottom), -2)
+
+
+class Kinematics(torch.nn.Module):
+    """The rig's joint tree with constant orientations.
+
+    Rotations are T-pose-relative: in axes aligned with the world at T-pose, identity is the T-pose, and
+    the joint orient cancels down the chain: ``W_j = (R_1 ... R_j) O_j``.
+    """
+
+    def __init__(self, rig: Rig, *, dtype: torch.dtype, device: torch.device | str) -> None:
+        super().__init__()
+        self.joint_count = rig.joint_count
+        parents = np.maximum(rig.parents, 0)
+        orient = rig.t_pose_world[:, :3, :3].copy()
+        orient[0] = np.eye(3)
+        bind = rig.bind_world[:, :3, :3]
+        bind_local = np.einsum("jba,jbc->jac", bind[parents], bind)
+        bind_relative = np.einsum("jab,jbc,jdc->jad", orient[parents], bind_local, orient)
+
+        def keep(name: str, array: np.ndarray) -> None:
+            tensor = torch.as_tensor(np.ascontiguousarray(array), device=device)
+            self.register_buffer(name, tensor.to(dtype) if tensor.is_floating_point() else tensor, persistent=False)
+
+        keep("parents", parents[1:])
+        keep("orient", orient)
+        keep("parent_orient", orient[parents])
+        keep("bind_relative", bind_relative[1:])
+        levels = joint_levels(rig.parents)
+        order = np.concatenate([[0], *levels])
+        where = np.argsort(order)
+        self.level_sizes = [len(level) for level in levels]
+        for index, level in enumerate(levels):
+            before = np.concatenate([[0], *levels])[: 1 + sum(self.level_sizes[:index])]
+            start = len(before) - (1 if index == 0 else self.level_sizes[index - 1])
+            keep(f"level_{index}", level)
+            keep(f"level_parent_{index}", where[parents[level]] - start)
+        keep("restore", where)
+
+    def local_offsets(self, bind_world: Tensor) -> Tensor:
+        """Bone vectors in parent-joint axes, turned to T-pose world axes; (B, J, 4, 4) -> (B, J, 3) [m]."""
+        positions, rotations = bind_world[..., :3, 3], bind_world[..., :3, :3]
+        step = positions[:, 1:] - positions[:, self.parents]
+        local = rotations[:, self.parents].transpose(-1, -2) @ step[..., None]
+        turned = (self.parent_orient[1:] @ local).squeeze(-1)
+        return torch.cat((positions[:, :1], turned), 1)
+
+    def forward(self, relative: Tensor, offsets: Tensor, translation: Tensor) -> tuple[Tensor, Tensor]:
+        """World rotations (B, J, 3, 3) and positions (B, J, 3) [m].
+
+        Args:
+            relative: (B, J - 1, 3, 3) T-pose-relative rotations of the user joints.
+            offsets: (B or 1, J, 3) from :meth:`local_offsets`.
+            translation: (B, 3) Hips position [m]; replaces its offset.
+        """
+        batch = len(relative)
+        eye = torch.eye(3, dtype=relative.dtype, device=relative.device).expand(batch, 1, 3, 3)
+        offsets = torch.cat((offsets[:, :1].expand(batch, 1, 3), translation[:, None],
+                             offsets[:, 2:].expand(batch, -1, 3)), 1)  # fmt: skip
+        turns, places = [eye], [offsets.new_zeros(batch, 1, 3)]
+        for index in range(len(self.level_sizes)):
+            level, parent = getattr(self, f"level_{index}"), getattr(self, f"level_parent_{index}")
+            above = turns[-1][:, parent]
+            places.append(places[-1][:, parent] + (above @ offsets[:, level, :, None]).squeeze(-1))
+            turns.append(above @ relative[:, level - 1])
+        rotations = torch.cat(turns, 1)[:, self.restore] @ self.orient
+        return rotations, torch.cat(places, 1)[:, self.restore]

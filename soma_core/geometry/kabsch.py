@@ -1,0 +1,106 @@
+"""Orthogonal Procrustes in closed form: the rotation nearest to a covariance (paper, equation 5)."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+__all__ = ["PRIOR_STRENGTH", "cofactor", "rotation_from_covariance"]
+
+PRIOR_STRENGTH = 1e-4
+"""Weight of the reference rotation, relative to the covariance: decides only degenerate clouds."""
+
+_NEWTON_STEPS = 9
+"""Scaled Newton steps; eight suffice for condition 1e16 (Higham 2008, section 8.6), one is spare."""
+
+_TINY = {torch.float32: 1e-30, torch.float64: 1e-200}
+
+
+def cofactor(matrix: Tensor) -> Tensor:
+    """Cofactor matrix, ``det(M) M^-T`` where M is regular; (..., 3, 3) -> (..., 3, 3)."""
+    a, b, c = matrix.unbind(-2)
+    cross = torch.linalg.cross
+    return torch.stack((cross(b, c, dim=-1), cross(c, a, dim=-1), cross(a, b, dim=-1)), -2)
+
+
+def _largest_singular_value(matrix: Tensor) -> Tensor:
+    """Closed form through the largest eigenvalue of ``M^T M`` (trigonometric solution of the cubic)."""
+    gram = matrix.transpose(-1, -2) @ matrix
+    mean = torch.diagonal(gram, dim1=-2, dim2=-1).sum(-1) / 3
+    centred = gram - mean[..., None, None] * torch.eye(3, dtype=matrix.dtype, device=matrix.device)
+    spread = ((centred * centred).sum((-1, -2)) / 6).sqrt()
+    safe = spread.clamp_min(_TINY[torch.float32] if matrix.dtype == torch.float32 else 1e-100)
+    scaled = centred / safe[..., None, None]
+    rows = scaled.unbind(-2)
+    half_det = 0.5 * (rows[0] * torch.linalg.cross(rows[1], rows[2], dim=-1)).sum(-1)
+    angle = torch.acos(half_det.clamp(-1, 1)) / 3
+    return (mean + 2 * spread * torch.cos(angle)).clamp_min(0).sqrt()
+
+
+def _nearest_rotation(covariance: Tensor) -> Tensor:
+    """Proper polar factor, for either sign of the determinant and for rank two, without a branch.
+
+    With singular values 1 >= s2 >= s3 and sign s, ``X = H + cof(H)`` has (1 + s s2 s3, s2 + s s3,
+    s3 + s s2) in the same bases, so its orthogonal polar factor is the *rotation* nearest to H.
+    Scaled Newton then converges quadratically whatever the conditioning.
+    """
+    scale = _largest_singular_value(covariance)
+    unit = covariance / scale.clamp_min(_TINY.get(covariance.dtype, 1e-30))[..., None, None]
+    x = unit + cofactor(unit)
+    for _ in range(_NEWTON_STEPS):
+        adjugate = cofactor(x)
+        det = (x[..., 0, :] * adjugate[..., 0, :]).sum(-1)
+        det = torch.where(det.abs() < 1e-30, torch.full_like(det, 1e-30), det)
+        norm, inverse_norm = x.norm(dim=(-1, -2)), adjugate.norm(dim=(-1, -2)) / det.abs()
+        stretch = (inverse_norm / norm).sqrt()
+        x = 0.5 * (stretch[..., None, None] * x + adjugate / (stretch * det)[..., None, None])
+    return x
+
+
+class _NearestRotation(torch.autograd.Function):
+    """Derivative in closed form: ``(tr(P) I - P) xi = eta`` with ``P = R^T H``, ``dR = R [xi]x``."""
+
+    @staticmethod
+    def forward(covariance: Tensor) -> Tensor:
+        return _nearest_rotation(covariance)
+
+    @staticmethod
+    def setup_context(ctx, inputs, output) -> None:
+        ctx.save_for_backward(inputs[0], output)
+
+    @staticmethod
+    def backward(ctx, grad: Tensor) -> Tensor:
+        covariance, rotation = ctx.saved_tensors
+        stretch = rotation.transpose(-1, -2) @ covariance
+        stretch = 0.5 * (stretch + stretch.transpose(-1, -2))
+        trace = torch.diagonal(stretch, dim1=-2, dim2=-1).sum(-1)
+        eye = torch.eye(3, dtype=grad.dtype, device=grad.device)
+        system = trace[..., None, None] * eye - stretch
+        local = rotation.transpose(-1, -2) @ grad
+        local = local - local.transpose(-1, -2)
+        torque = torch.stack((local[..., 2, 1], local[..., 0, 2], local[..., 1, 0]), -1)
+        adjugate = cofactor(system)  # symmetric, so the cofactor is the adjugate
+        det = (system[..., 0, :] * adjugate[..., 0, :]).sum(-1)
+        floor = torch.finfo(grad.dtype).tiny + torch.finfo(grad.dtype).eps * trace.abs() ** 3 * 1e-6
+        u = (adjugate @ torque[..., None]).squeeze(-1) / torch.where(det.abs() < floor, floor, det)[..., None]
+        x, y, z = u.unbind(-1)
+        zero = torch.zeros_like(x)
+        generator = torch.stack((zero, -z, y, z, zero, -x, -y, x, zero), -1).unflatten(-1, (3, 3))
+        return rotation @ generator
+
+
+def rotation_from_covariance(covariance: Tensor, *, reference: Tensor | None = None) -> Tensor:
+    """Rotation R in SO(3) that maximises ``<R, H>`` for ``H = sum target source^T``; (..., 3, 3) each.
+
+    A weak pull towards `reference` (identity by default), proportional to ``|H|``, decides clouds of
+    rank one or zero: H = 0 returns the reference. Differentiable; the derivative is exact wherever
+    the maximiser is unique. Paper, equation 5, in place of its SVD and equation 8.
+    """
+    if reference is None:
+        reference = torch.eye(3, dtype=covariance.dtype, device=covariance.device)
+    squared = (covariance * covariance).sum((-1, -2))
+    floor = 1e-24 if covariance.dtype == torch.float32 else math.ulp(0.0) ** 0.5
+    pull = PRIOR_STRENGTH * (squared + floor).sqrt()
+    return _NearestRotation.apply(covariance + pull[..., None, None] * reference)

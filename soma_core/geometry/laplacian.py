@@ -1,0 +1,39 @@
+"""Cotangent Laplacian of a triangle mesh."""
+
+from __future__ import annotations
+
+import numpy as np
+import scipy.sparse
+
+__all__ = ["cotangent_laplacian"]
+
+_CLAMP = 1e-6
+"""Smallest edge weight relative to the mean: keeps the interior block positive definite."""
+
+
+def cotangent_laplacian(vertices: np.ndarray, triangles: np.ndarray) -> scipy.sparse.csr_array:
+    """Positive semi-definite Laplacian L (v, v): ``L[i, i] = sum_j w_ij``, ``L[i, j] = -w_ij``.
+
+    ``w_ij`` is half the sum of the cotangents opposite edge ij, clamped from below because obtuse
+    pairs make some negative; rows sum to zero. Degenerate triangles contribute nothing.
+
+    Args:
+        vertices: (v, 3) float64, any unit.
+        triangles: (t, 3) integers.
+    """
+    count = len(vertices)
+    rows, columns, values = [], [], []
+    for corner in range(3):
+        i, j, k = (triangles[:, (corner + shift) % 3] for shift in (0, 1, 2))
+        a, b = vertices[j] - vertices[i], vertices[k] - vertices[i]
+        area = np.linalg.norm(np.cross(a, b), axis=1)
+        cotangent = np.divide((a * b).sum(1), area, out=np.zeros(len(a)), where=area > 0)
+        rows.append(j)
+        columns.append(k)
+        values.append(0.5 * cotangent)
+    row, column, value = np.concatenate(rows), np.concatenate(columns), np.concatenate(values)
+    half = scipy.sparse.coo_array((value, (row, column)), shape=(count, count))
+    weights = (half + half.T).tocsr()
+    weights.data = np.maximum(weights.data, _CLAMP * np.abs(weights.data).mean())
+    degree = np.asarray(weights.sum(1)).ravel()
+    return (scipy.sparse.diags_array(degree) - weights).tocsr()

@@ -1,0 +1,56 @@
+"""Sparse operators on tall matrices: gather, weigh and add rows, forward and backward in fixed order."""
+
+from __future__ import annotations
+
+import numpy as np
+import scipy.sparse
+import torch
+from torch import Tensor
+from torch.nn.functional import embedding_bag
+
+__all__ = ["SparseRows"]
+
+
+class _Gather(torch.autograd.Function):
+    """``out = A @ dense`` with constant A; the backward pass applies the transpose, row by row."""
+
+    @staticmethod
+    def forward(dense, crow, col, val, t_crow, t_col, t_val):
+        return embedding_bag(col, dense, crow, mode="sum", per_sample_weights=val, include_last_offset=True)
+
+    @staticmethod
+    def setup_context(ctx, inputs, output) -> None:
+        ctx.save_for_backward(*inputs[4:])
+
+    @staticmethod
+    def backward(ctx, grad):
+        crow, col, val = ctx.saved_tensors
+        back = embedding_bag(
+            col, grad.contiguous(), crow, mode="sum", per_sample_weights=val, include_last_offset=True
+        )
+        return back, None, None, None, None, None, None
+
+
+class SparseRows(torch.nn.Module):
+    """A constant sparse matrix (m, n) in CSR form, with its transpose for the backward pass.
+
+    ``operator(dense)`` computes the (m, f) product with a contiguous dense (n, f) matrix. Sums run in
+    index order on every device, so results are deterministic.
+    """
+
+    def __init__(self, matrix: scipy.sparse.sparray, *, dtype: torch.dtype, device: torch.device | str) -> None:
+        super().__init__()
+        forward, backward = matrix.tocsr(), matrix.T.tocsr()
+        self.shape = tuple(forward.shape)
+        for prefix, csr in (("", forward), ("t_", backward)):
+            csr.sort_indices()
+            self._keep(prefix + "crow", csr.indptr, torch.int64, device)
+            self._keep(prefix + "col", csr.indices, torch.int64, device)
+            self._keep(prefix + "val", csr.data, dtype, device)
+
+    def _keep(self, name: str, array: np.ndarray, dtype: torch.dtype, device: torch.device | str) -> None:
+        self.register_buffer(name, torch.as_tensor(array.copy()).to(dtype=dtype, device=device), persistent=False)
+
+    def forward(self, dense: Tensor) -> Tensor:
+        """Product with (n, f); (m, f)."""
+        return _Gather.apply(dense, self.crow, self.col, self.val, self.t_crow, self.t_col, self.t_val)
