@@ -8,6 +8,8 @@ from typing import Literal
 
 import numpy as np
 
+from soma_core.errors import InputError
+
 __all__ = ["Convention", "Motion"]
 
 Convention = Literal["t_pose_relative", "absolute_local"]
@@ -26,6 +28,10 @@ class Motion:
         rig_revision: revision of the rig the rotations were made for, empty if unknown.
         source: where the motion came from.
         identity: optional backend name and parameters it was recorded with.
+        licence: licence or terms of the motion, empty if unknown.
+
+    Raises:
+        InputError: a shape, a value, the frame rate or the convention cannot be a motion.
     """
 
     rotations: np.ndarray
@@ -36,8 +42,53 @@ class Motion:
     rig_revision: str = ""
     source: str = ""
     identity: Mapping[str, object] = field(default_factory=dict)
+    licence: str = ""
+
+    def __post_init__(self) -> None:
+        rotations = np.asarray(self.rotations, np.float32)
+        translation = np.asarray(self.translation, np.float32)
+        object.__setattr__(self, "rotations", rotations)
+        object.__setattr__(self, "translation", translation)
+        frames = len(rotations) if rotations.ndim else 0
+        _expect("rotations", rotations, (frames, len(self.joint_names), 3, 3))
+        _expect("translation", translation, (frames, 3))
+        if frames == 0:
+            raise InputError("rotations", got="0 frames", expected="at least one", fix="Give a longer clip.")
+        if not (np.isfinite(self.fps) and self.fps > 0):
+            raise InputError(
+                "fps",
+                got=self.fps,
+                expected="a positive number",
+                fix="Give the frame rate in frames per second.",
+            )
+        if self.convention not in ("t_pose_relative", "absolute_local"):
+            raise InputError(
+                "convention",
+                got=repr(self.convention),
+                expected="'t_pose_relative' or 'absolute_local'",
+                fix="Say which zero the rotations have.",
+            )
 
     @property
     def frame_count(self) -> int:
         """Number of frames."""
         return len(self.rotations)
+
+
+def _expect(argument: str, array: np.ndarray, shape: tuple[int, ...]) -> None:
+    """Refuse another shape and values that are not finite."""
+    if array.shape != shape:
+        raise InputError(
+            argument,
+            got=f"shape {array.shape}",
+            expected=f"shape {shape}",
+            fix="Give one entry per frame and joint.",
+        )
+    bad = np.argwhere(~np.isfinite(array))
+    if len(bad):
+        raise InputError(
+            argument,
+            got=f"{array[tuple(bad[0])]} at index {tuple(map(int, bad[0]))}",
+            expected="finite numbers",
+            fix="Remove or interpolate the damaged frames.",
+        )

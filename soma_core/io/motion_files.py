@@ -1,0 +1,164 @@
+"""Read and write motion files; the layout of a file is told from its keys."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from soma_core.cache import atomic_write
+from soma_core.errors import InputError
+from soma_core.io.joint_order import USER_JOINTS
+from soma_core.io.kimodo_npz import read_kimodo_npz
+from soma_core.io.motion import Convention, Motion
+from soma_core.io.npz_fields import check_rotations, open_npz
+from soma_core.io.soma_npz import SCHEMA_VERSION, read_soma_npz
+
+__all__ = ["check_rig", "read_motion", "write_motion"]
+
+
+def read_motion(
+    path: str | Path,
+    *,
+    fps: float | None = None,
+    unit: str | None = None,
+    convention: Convention | None = None,
+) -> Motion:
+    """Read a motion from an NPZ file: our schema, the SOMA tools' files, or kimodo's.
+
+    Args:
+        path: the file. Nothing in it is executed; keys that are not needed are ignored.
+        fps: frame rate; needed where the file has none (SOMA tools). kimodo files count as 30.
+        unit: ``meters``, ``centimeters`` or ``millimeters``; overrides the file's own.
+        convention: what zero means; overrides the file's own.
+
+    Returns:
+        The motion in metres, +Y up, 77 joints with Hips first.
+
+    Raises:
+        AssetError: the file is missing, damaged, a git-LFS pointer or no NPZ.
+        InputError: the layout is unknown, or a key is missing or holds what a motion cannot have.
+    """
+    with open_npz(path) as fields:
+        if "global_rot_mats" in fields or "local_rot_mats" in fields:
+            return read_kimodo_npz(fields, fps=fps)
+        if "schema_version" in fields or ("poses" in fields and "transl" in fields):
+            return read_soma_npz(fields, fps=fps, unit=unit, convention=convention)
+        raise fields.refuse(
+            "layout",
+            got=f"the keys {', '.join(fields.names) or '(none)'}",
+            expected="'poses' and 'transl' (SOMA), or 'global_rot_mats' (kimodo)",
+            fix="Convert the motion to the SOMA skeleton first.",
+        )
+
+
+def write_motion(
+    motion: Motion,
+    path: str | Path,
+    *,
+    rotation_repr: Literal["matrix", "rotvec"] = "matrix",
+    joint_orient: np.ndarray | None = None,
+) -> None:
+    """Write `motion` in our schema, atomically; the SOMA tools' keys are part of it.
+
+    Args:
+        motion: what to write; metres, +Y up.
+        path: the NPZ file.
+        rotation_repr: ``matrix`` is exact to float32; ``rotvec`` is a third of the size and exact to
+            about 1e-6 rad.
+        joint_orient: (77, 3, 3) world rotations of the T-pose of the motion's rig. The SOMA tools expect
+            them beside T-pose-relative rotations; our reader does not need them.
+
+    Raises:
+        InputError: the joints are not the 77 user joints in order, or a matrix is no rotation.
+    """
+    if tuple(motion.joint_names) != USER_JOINTS:
+        raise InputError(
+            "motion.joint_names",
+            got=f"{len(motion.joint_names)} names that start with {motion.joint_names[:2]}",
+            expected="the 77 user joints, Hips first",
+            fix="Order the joints like soma_core.io.USER_JOINTS.",
+        )
+    check_rotations("motion.rotations", motion.rotations.astype(np.float64))
+    arrays = _arrays(motion, rotation_repr)
+    if joint_orient is not None and motion.convention == "t_pose_relative":
+        arrays["joint_orient"] = np.asarray(joint_orient, np.float32)
+    # np.savez appends .npz to other names, and the rename would then miss the file: hand it a stream.
+    atomic_write(Path(path), lambda temporary: _save(temporary, arrays))
+
+
+def _save(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
+    with open(path, "wb") as stream:
+        np.savez_compressed(stream, **arrays)
+
+
+def _arrays(motion: Motion, rotation_repr: str) -> dict[str, np.ndarray]:
+    """The keys of the schema; text is stored as unicode arrays, never as objects."""
+    poses = motion.rotations
+    if rotation_repr == "rotvec":
+        vectors = Rotation.from_matrix(poses.reshape(-1, 3, 3).astype(np.float64)).as_rotvec()
+        poses = vectors.reshape(*poses.shape[:2], 3).astype(np.float32)
+    values = {
+        "schema_version": SCHEMA_VERSION,
+        "poses": poses,
+        "transl": motion.translation,
+        "rotation_repr": rotation_repr,
+        "convention": motion.convention,
+        "absolute_pose": motion.convention == "absolute_local",
+        "joint_names": np.array(motion.joint_names),
+        "keep_root": False,
+        "fps": float(motion.fps),
+        "unit": "meters",
+        "up_axis": "Y",
+        "root_translation": "hips_world_position",
+        "rig_hash": motion.rig_revision,
+        "source": motion.source,
+        "licence": motion.licence,
+    }
+    return {name: np.asarray(value) for name, value in (values | _identity(motion.identity)).items()}
+
+
+def _identity(identity: Mapping[str, object]) -> dict[str, object]:
+    """Identity keys: the backend, its parameters by name, and the same numbers in one row."""
+    if not identity:
+        return {}
+    params = identity.get("params", {})
+    if not isinstance(params, Mapping):
+        raise InputError(
+            "motion.identity",
+            got=type(params).__name__,
+            expected="a mapping under 'params'",
+            fix="Name the values.",
+        )
+    plain = {name: np.asarray(value, np.float64).tolist() for name, value in params.items()}
+    row = np.concatenate([np.empty(0), *(np.ravel(value) for value in plain.values())])[None]
+    coefficients = identity.get("identity_coeffs", row)
+    return {
+        "identity_model_type": str(identity.get("backend", "")),
+        "identity_params": json.dumps(plain, sort_keys=True),
+        "identity_coeffs": np.asarray(coefficients, np.float32),
+    }
+
+
+def check_rig(motion: Motion, revision: str) -> bool:
+    """Tell whether `motion` was made for the rig `revision`; an unknown rig counts as the same.
+
+    Relative rotations mean nearly the same on every revision, so another rig is only reported (False).
+
+    Raises:
+        InputError: absolute rotations of another rig, which would bend every joint.
+    """
+    made_for, here = (name.split("-")[0][:16] for name in (motion.rig_revision, revision))
+    same = not made_for or not here or made_for == here
+    if not same and motion.convention == "absolute_local":
+        raise InputError(
+            "motion.rig_revision",
+            got=made_for,
+            expected=here,
+            fix="Convert it to T-pose-relative rotations with the rig it was made for.",
+        )
+    return same

@@ -1,0 +1,198 @@
+"""Read SOMA motion files: the schema of this package, and the older files of the SOMA tools."""
+
+from __future__ import annotations
+
+import json
+from typing import cast
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from soma_core.io.joint_order import USER_JOINTS
+from soma_core.io.motion import Convention, Motion
+from soma_core.io.npz_fields import NpzFields, check_rotations
+
+__all__ = ["METRES_PER_UNIT", "SCHEMA_VERSION", "read_soma_npz"]
+
+SCHEMA_VERSION = 1
+"""Version of the motion schema that this package writes."""
+
+METRES_PER_UNIT = {"meters": 1.0, "centimeters": 0.01, "millimeters": 0.001}
+
+_ROOT_TOLERANCE = 1e-4
+"""Largest entry of |R_Root - I| accepted: Root is virtual, only rounding may move it."""
+
+
+def read_soma_npz(
+    fields: NpzFields, *, fps: float | None, unit: str | None, convention: Convention | None
+) -> Motion:
+    """Read a motion whose rotations are stored under ``poses``.
+
+    Files without ``schema_version`` are those of the SOMA tools: they hold neither frame rate nor rig
+    revision, may list the virtual Root first, and rotation vectors written by the reference converters
+    are doubled for angles up to 1e-3 rad (below what can be told apart from motion, so kept).
+
+    Raises:
+        InputError: a key is missing, has another layout, or contradicts another key.
+    """
+    _check_schema(fields)
+    rotations = _rotations(fields)
+    rotations = rotations[:, _columns(fields, rotations)]
+    translation = fields.numbers("transl", (len(rotations), 3)) * _metres(fields, unit)
+    return Motion(
+        rotations=rotations,
+        translation=translation,
+        fps=_frame_rate(fields, fps),
+        joint_names=USER_JOINTS,
+        convention=_convention(fields, convention),
+        rig_revision=fields.text("rig_hash", ""),
+        source=fields.text("source", "") or f"SOMA motion file {fields.path.name}",
+        identity=_identity(fields),
+        licence=fields.text("licence", ""),
+    )
+
+
+def _check_schema(fields: NpzFields) -> None:
+    if "schema_version" not in fields:
+        return
+    version = fields.number("schema_version")
+    if version != SCHEMA_VERSION:
+        raise fields.refuse(
+            "schema_version",
+            got=f"{version:g}",
+            expected=SCHEMA_VERSION,
+            fix="Read it with the release of soma-body-core that wrote it, or update this one.",
+        )
+    up_axis = fields.text("up_axis")
+    if up_axis.upper() != "Y":
+        raise fields.refuse(
+            "up_axis", got=repr(up_axis), expected="'Y'", fix="Rotate the motion to +Y up first."
+        )
+    meaning = fields.text("root_translation")
+    if meaning != "hips_world_position":
+        raise fields.refuse(
+            "root_translation",
+            got=repr(meaning),
+            expected="'hips_world_position'",
+            fix="Store the world position of Hips, not an offset.",
+        )
+
+
+def _rotations(fields: NpzFields) -> np.ndarray:
+    """Matrices (frames, joints, 3, 3) float64, stored as such or as rotation vectors."""
+    stored = fields.raw("poses")
+    default = "matrix" if stored.ndim == 4 else "rotvec"
+    kind = fields.text("rotation_repr", default)
+    if kind not in ("rotvec", "matrix"):
+        raise fields.refuse(
+            "rotation_repr", got=repr(kind), expected="'rotvec' or 'matrix'", fix="Convert the rotations."
+        )
+    if kind == "matrix":
+        matrices = fields.numbers("poses", ("frames", "77 or 78", 3, 3))
+        check_rotations(f"{fields.path}: poses", matrices)
+        return matrices
+    vectors = fields.numbers("poses", ("frames", "77 or 78", 3))
+    return Rotation.from_rotvec(vectors.reshape(-1, 3)).as_matrix().reshape(*vectors.shape, 3)
+
+
+def _columns(fields: NpzFields, rotations: np.ndarray) -> list[int]:
+    """Column of each user joint in the file, found by name where names are stored."""
+    count = rotations.shape[1]
+    names = fields.texts("joint_names") if "joint_names" in fields else ()
+    if len(names) == count + 1 and names[0] == "Root":
+        names = names[1:]
+    names = names or {77: USER_JOINTS, 78: ("Root", *USER_JOINTS)}.get(count, ())
+    missing = [name for name in USER_JOINTS if name not in names]
+    if count not in (77, 78) or len(names) != count or missing:
+        lost = " Hips is not among them: it was dropped on writing (keep_root)." if "Hips" in missing else ""
+        raise fields.refuse(
+            "poses",
+            got=f"{count} joints and {len(names)} names that start with {names[:2]}.{lost}",
+            expected="the 77 joints of the skeleton, or those and Root",
+            fix="Export the motion again with all joints (keep_root=True with 77 joints).",
+        )
+    if names[0] == "Root":
+        _check_root(fields, rotations[:, 0])
+    return [names.index(name) for name in USER_JOINTS]
+
+
+def _check_root(fields: NpzFields, root: np.ndarray) -> None:
+    moved = np.abs(root - np.eye(3)).max(axis=(1, 2))
+    if moved.max() > _ROOT_TOLERANCE:
+        raise fields.refuse(
+            "poses",
+            got=f"a rotated Root (|R - I| = {moved.max():.3g} in frame {int(moved.argmax())})",
+            expected="the identity for Root, which is virtual",
+            fix="Put the global rotation and position into Hips.",
+        )
+
+
+def _metres(fields: NpzFields, unit: str | None) -> float:
+    name = unit if unit is not None else fields.text("unit", "")
+    if name not in METRES_PER_UNIT:
+        raise fields.refuse(
+            "unit",
+            got=repr(name) if name else "no unit",
+            expected=" or ".join(map(repr, METRES_PER_UNIT)),
+            fix="Pass unit='meters' (or the true unit) to read_motion.",
+        )
+    return METRES_PER_UNIT[name]
+
+
+def _frame_rate(fields: NpzFields, fps: float | None) -> float:
+    if fps is not None:
+        return float(fps)
+    if "fps" not in fields:
+        raise fields.refuse(
+            "fps",
+            got="no frame rate",
+            expected="frames per second",
+            fix="Pass fps=30 (or the true rate) to read_motion.",
+        )
+    return fields.number("fps")
+
+
+def _convention(fields: NpzFields, convention: Convention | None) -> Convention:
+    """What zero means, from the first of: the argument, our key, the flags of the SOMA tools."""
+    if convention is not None:
+        return convention
+    if "convention" in fields:
+        return cast("Convention", fields.text("convention"))
+    has_orient = "joint_orient" in fields
+    relative = not fields.number("absolute_pose") if "absolute_pose" in fields else has_orient
+    if relative != has_orient:
+        raise fields.refuse(
+            "absolute_pose",
+            got=f"absolute_pose={not relative} {'with' if has_orient else 'without'} joint_orient",
+            expected="joint_orient exactly when poses are T-pose-relative",
+            fix="Pass convention='t_pose_relative' or 'absolute_local' to read_motion.",
+        )
+    return "t_pose_relative" if relative else "absolute_local"
+
+
+def _identity(fields: NpzFields) -> dict[str, object]:
+    """Backend name and parameters, as far as the file tells."""
+    backend = fields.text("identity_model_type", "")
+    if not backend:
+        return {}
+    if "identity_params" in fields:
+        return {"backend": backend, "params": _parsed(fields)}
+    found: dict[str, object] = {"backend": backend}
+    for key in ("identity_coeffs", "scale_params"):
+        if key in fields and fields.raw(key).dtype.kind == "f":
+            found[key] = fields.raw(key).astype(np.float32)
+    return found
+
+
+def _parsed(fields: NpzFields) -> dict[str, object]:
+    text = fields.text("identity_params")
+    try:
+        params = json.loads(text)
+    except json.JSONDecodeError as error:
+        raise fields.refuse(
+            "identity_params",
+            got=repr(text[:40]),
+            expected="a JSON object",
+            fix=f"Write valid JSON ({error}).",
+        ) from error
+    return dict(params)
