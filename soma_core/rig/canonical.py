@@ -1,0 +1,127 @@
+"""Load the canonical mesh and rig, from the shipped files or from the cache of what they hold."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+import scipy.sparse
+
+from soma_core.cache import cached_arrays, content_key
+from soma_core.errors import AssetError, InputError
+from soma_core.paths import assets_dir
+from soma_core.rig.manifest import NEUTRAL_NAME, RIG_NAME, Manifest, read_manifest, verified_sha256
+from soma_core.rig.mesh import CanonicalMesh, Lod
+from soma_core.rig.neutral import SEGMENT_NAMES, read_topology
+from soma_core.rig.revision import lod_revision
+from soma_core.rig.skeleton import Rig
+
+__all__ = ["load_canonical"]
+
+_LAYOUT = 1  # raise when the cached arrays change meaning
+_SEGMENT = "segment_"
+
+
+def _low_topology(topology: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Restrict topology and segments to the low LOD, in its own ids."""
+    mid_ids = topology["lod_mid_to_low"]
+    to_low = np.full(len(topology["mirror_vert_indices"]), -1, np.int32)
+    to_low[mid_ids] = np.arange(len(mid_ids), dtype=np.int32)
+    low = {
+        "mid_ids": mid_ids,
+        "triangles": topology["triangles_low"],
+        "mirror": to_low[topology["mirror_vert_indices"][mid_ids]],
+    }
+    for name in SEGMENT_NAMES:
+        ids = to_low[topology[_SEGMENT + name]]
+        low[_SEGMENT + name] = ids[ids >= 0]
+    return low
+
+
+def _mid_topology(topology: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+    mirror = topology["mirror_vert_indices"]
+    mid = {"mid_ids": np.arange(len(mirror), dtype=np.int32), "mirror": mirror}
+    mid["triangles"] = topology["triangles"]
+    return mid | {_SEGMENT + name: topology[_SEGMENT + name] for name in SEGMENT_NAMES}
+
+
+def _parse(root: Path, lod: Lod, manifest: Manifest) -> dict[str, np.ndarray]:
+    """Read both files and flatten what one LOD needs into arrays."""
+    from soma_core.rig.usd import read_usd_rig  # imports pxr, needed only without a cache
+
+    topology = read_topology(root / NEUTRAL_NAME)
+    found = read_usd_rig(root / RIG_NAME, lod=lod, triangles=topology["triangles"])
+    if lod == "mid" and found.rig_hash != manifest.rig_hash:
+        cause = f"rig revision is {found.rig.revision}, the manifest says {manifest.rig_revision}"
+        raise AssetError(root / RIG_NAME, cause=cause, fix="Make the assets again with `soma assets build`")
+    rig = found.rig
+    arrays = _mid_topology(topology) if lod == "mid" else _low_topology(topology)
+    return arrays | {
+        "joint_names": np.array(rig.joint_names),
+        "parents": rig.parents,
+        "bind_world": rig.bind_world,
+        "t_pose_world": rig.t_pose_world,
+        "bind_shape": rig.bind_shape,
+        "weights_data": rig.weights.data,
+        "weights_indices": rig.weights.indices,
+        "weights_indptr": rig.weights.indptr,
+        "face_vert_indices": found.face_vert_indices,
+        "face_vert_counts": found.face_vert_counts,
+        "uv": found.uv,
+        "uv_indices": found.uv_indices,
+    }
+
+
+def load_canonical(lod: Lod = "mid", root: Path | str | None = None) -> tuple[CanonicalMesh, Rig]:
+    """Load the canonical mesh and rig in metres, +Y up; every array is read-only.
+
+    The files are checked against the manifest on every call; what they hold is parsed once and
+    cached, keyed by their contents.
+
+    Args:
+        lod: "mid" (18,056 vertices) or "low" (4,505, an index subset of mid).
+        root: assets folder; default: the shipped one.
+
+    Raises:
+        AssetError: a file is missing, damaged or not the one of the manifest.
+        InputError: unknown `lod`.
+    """
+    if lod not in ("mid", "low"):
+        raise InputError("lod", got=repr(lod), expected="'mid' or 'low'", fix="Choose one of the two.")
+    root = assets_dir() if root is None else Path(root)
+    manifest = read_manifest(root)
+    sums = [verified_sha256(root, manifest, name) for name in (RIG_NAME, NEUTRAL_NAME)]
+    key = content_key(_LAYOUT, lod, manifest.rig_hash, *sums)
+    arrays = cached_arrays("canonical", key, lambda: _parse(root, lod, manifest))
+    for array in arrays.values():
+        array.setflags(write=False)
+    return _assemble(arrays, lod, lod_revision(manifest.rig_hash, lod))
+
+
+def _assemble(arrays: Mapping[str, np.ndarray], lod: Lod, revision: str) -> tuple[CanonicalMesh, Rig]:
+    mesh = CanonicalMesh(
+        vertices=arrays["bind_shape"],
+        triangles=arrays["triangles"],
+        face_vert_indices=arrays["face_vert_indices"],
+        face_vert_counts=arrays["face_vert_counts"],
+        uv=arrays["uv"],
+        uv_indices=arrays["uv_indices"],
+        segments={name: arrays[_SEGMENT + name] for name in SEGMENT_NAMES},
+        mirror=arrays["mirror"],
+        mid_ids=arrays["mid_ids"],
+        lod=lod,
+        revision=revision,
+    )
+    names = tuple(arrays["joint_names"].tolist())
+    sparse = (arrays["weights_data"], arrays["weights_indices"], arrays["weights_indptr"])
+    rig = Rig(
+        joint_names=names,
+        parents=arrays["parents"],
+        bind_world=arrays["bind_world"],
+        t_pose_world=arrays["t_pose_world"],
+        bind_shape=arrays["bind_shape"],
+        weights=scipy.sparse.csr_array(sparse, shape=(len(arrays["bind_shape"]), len(names))),
+        revision=revision,
+    )
+    return mesh, rig

@@ -1,0 +1,89 @@
+"""Skin weights of a USD mesh: checked, and brought to the order of its skeleton's joints."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+import scipy.sparse
+
+from soma_core.errors import AssetError
+
+if TYPE_CHECKING:
+    from pxr import Usd
+
+__all__ = ["ROW_SUM_TOLERANCE", "read_weights"]
+
+ROW_SUM_TOLERANCE = 1e-4  # float32 weights of up to 14 influences, with room for other exporters
+
+
+def _joint_map(path: Path, skin: Usd.Prim, joint_paths: Sequence[str]) -> np.ndarray:
+    """Skeleton joint of each entry of the mesh's own ``skel:joints`` (all joints when absent)."""
+    from pxr import UsdSkel
+
+    subset = UsdSkel.BindingAPI(skin).GetJointsAttr().Get()
+    if not subset:
+        return np.arange(len(joint_paths))
+    index = {joint: position for position, joint in enumerate(joint_paths)}
+    unknown = [joint for joint in subset if joint not in index]
+    if unknown:
+        cause = f"skel:joints of {skin.GetPath()} names {len(unknown)} unknown joints, first {unknown[0]}"
+        raise AssetError(path, cause=cause, fix="Use the joint paths of the skeleton")
+    return np.array([index[joint] for joint in subset])
+
+
+def _per_vertex(path: Path, skin: Usd.Prim, name: str, vertex_count: int) -> np.ndarray:
+    """One influence primvar as (v, k)."""
+    from pxr import UsdGeom
+
+    primvar = UsdGeom.PrimvarsAPI(skin).GetPrimvar(name)
+    values = np.array(primvar.Get() if primvar and primvar.HasValue() else [])
+    width = primvar.GetElementSize() if primvar else 1
+    if primvar and primvar.GetInterpolation() == "constant" and len(values) == width:
+        return np.broadcast_to(values, (vertex_count, width))  # a rigidly bound mesh
+    if len(values) != vertex_count * width:
+        cause = (
+            f"{name} of {skin.GetPath()} holds {len(values)} values, "
+            f"expected {vertex_count} points times elementSize {width}"
+        )
+        raise AssetError(path, cause=cause, fix="Export the skin weights again")
+    return values.reshape(vertex_count, width)
+
+
+def read_weights(
+    path: Path, skin: Usd.Prim, joint_paths: Sequence[str], vertex_count: int
+) -> scipy.sparse.csr_array:
+    """Read skin weights as stored: (v, J) CSR float64, zeros dropped, joints in skeleton order.
+
+    Raises:
+        AssetError: unknown joints, wrong counts, indices out of range, or weights that are
+            negative, not finite or do not sum to 1 within `ROW_SUM_TOLERANCE`.
+    """
+    fix = "Normalise the skin weights and export again"
+    joints = _joint_map(path, skin, joint_paths)
+    indices = _per_vertex(path, skin, "skel:jointIndices", vertex_count)
+    values = _per_vertex(path, skin, "skel:jointWeights", vertex_count).astype(np.float64)
+    if indices.shape != values.shape:
+        cause = f"jointIndices and jointWeights have elementSize {indices.shape[1]} and {values.shape[1]}"
+        raise AssetError(path, cause=cause, fix="Export the skin weights again")
+    if not np.isfinite(values).all():
+        vertex = int(np.argwhere(~np.isfinite(values))[0, 0])
+        raise AssetError(path, cause=f"skin weights of vertex {vertex} are NaN or infinite", fix=fix)
+    if values.min() < 0:
+        vertex = int(np.argwhere(values < 0)[0, 0])
+        raise AssetError(path, cause=f"vertex {vertex} has a negative skin weight {values.min():.6g}", fix=fix)
+    used = values > 0
+    outside = used & ((indices < 0) | (indices >= len(joints)))
+    if outside.any():
+        cause = f"jointIndices holds {int(indices[outside][0])}, but the mesh has {len(joints)} joints"
+        raise AssetError(path, cause=cause, fix="Export the skin weights again")
+    error = np.abs(values.sum(axis=1) - 1)
+    if error.max() > ROW_SUM_TOLERANCE:
+        vertex = int(error.argmax())
+        cause = f"skin weights of vertex {vertex} sum to {values[vertex].sum():.6g}, expected 1"
+        raise AssetError(path, cause=cause, fix=fix)
+    rows = np.nonzero(used)[0]
+    entries = (values[used], (rows, joints[indices[used]]))
+    return scipy.sparse.csr_array(scipy.sparse.coo_array(entries, shape=(vertex_count, len(joint_paths))))

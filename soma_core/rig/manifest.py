@@ -1,0 +1,130 @@
+"""The list of shipped assets, and the checks that a file on disk is the one that was shipped."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from soma_core.cache import atomic_write, file_sha256
+from soma_core.errors import AssetError
+
+__all__ = [
+    "MANIFEST_NAME",
+    "NEUTRAL_NAME",
+    "RIG_NAME",
+    "Manifest",
+    "check_files",
+    "read_manifest",
+    "refuse_unreadable",
+    "verified_sha256",
+    "write_manifest",
+]
+
+MANIFEST_NAME = "MANIFEST.json"
+RIG_NAME = "SOMA_template_rig.usda"
+NEUTRAL_NAME = "SOMA_neutral.npz"
+
+_SCHEMA = 1
+_RESTORE = "Restore it with `git checkout -- assets`, or make it again with `soma assets build`"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Manifest:
+    """What the assets folder must hold.
+
+    Attributes:
+        rig_hash: 64 hex digits of the mid rig; `rig_revision` is its first 16.
+        files: name -> sha256, size, licence, origin, unit, counts.
+    """
+
+    rig_hash: str
+    rig_revision: str
+    files: Mapping[str, Mapping[str, Any]]
+
+
+def refuse_unreadable(path: Path) -> None:
+    """Refuse a file that is absent, empty or a git-LFS pointer.
+
+    Raises:
+        AssetError: in these three cases.
+    """
+    if not path.is_file():
+        raise AssetError(path, cause="file is missing", fix=_RESTORE)
+    with open(path, "rb") as stream:
+        head = stream.read(64)
+    if not head:
+        raise AssetError(path, cause="file is empty", fix=_RESTORE)
+    if head.startswith(b"version https://git-lfs"):
+        raise AssetError(path, cause="file is a git-LFS pointer, not the data", fix="Fetch it with `git lfs pull`")
+
+
+def read_manifest(root: Path) -> Manifest:
+    """Read ``MANIFEST.json`` of an assets folder.
+
+    Raises:
+        AssetError: missing, not JSON, of another schema, or without a required key.
+    """
+    path = root / MANIFEST_NAME
+    refuse_unreadable(path)
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except ValueError as error:
+        raise AssetError(path, cause=f"not valid JSON ({error})", fix=_RESTORE) from error
+    schema = content.get("schema") if isinstance(content, dict) else None
+    if schema != _SCHEMA:
+        raise AssetError(path, cause=f"manifest schema is {schema}, expected {_SCHEMA}", fix=_RESTORE)
+    missing = [key for key in ("rig_hash", "rig_revision", "files") if key not in content]
+    if missing:
+        raise AssetError(path, cause=f"missing keys {missing}", fix=_RESTORE)
+    return Manifest(
+        rig_hash=content["rig_hash"], rig_revision=content["rig_revision"], files=content["files"]
+    )
+
+
+def write_manifest(root: Path, manifest: Manifest) -> None:
+    """Write ``MANIFEST.json``: sorted keys, one line a value, atomic."""
+    content = {
+        "schema": _SCHEMA,
+        "rig_hash": manifest.rig_hash,
+        "rig_revision": manifest.rig_revision,
+        "files": {name: dict(entry) for name, entry in manifest.files.items()},
+    }
+    text = json.dumps(content, indent=2, sort_keys=True) + "\n"
+    atomic_write(root / MANIFEST_NAME, lambda temporary: temporary.write_text(text, encoding="utf-8"))
+
+
+def verified_sha256(root: Path, manifest: Manifest, name: str) -> str:
+    """Check one asset against the manifest and return its SHA-256.
+
+    Raises:
+        AssetError: not listed, missing, a git-LFS pointer, of another size, or of another hash.
+    """
+    path = root / name
+    if name not in manifest.files:
+        raise AssetError(root / MANIFEST_NAME, cause=f"does not list {name}", fix=_RESTORE)
+    refuse_unreadable(path)
+    expected = manifest.files[name]
+    size = path.stat().st_size
+    if size != expected["size"]:
+        state = "truncated" if size < expected["size"] else "not the shipped one"
+        cause = f"file is {state}: {size} bytes, expected {expected['size']}"
+        raise AssetError(path, cause=cause, fix=_RESTORE)
+    got = file_sha256(path)
+    if got != expected["sha256"]:
+        cause = f"SHA-256 is {got[:16]}..., expected {expected['sha256'][:16]}..."
+        raise AssetError(path, cause=cause, fix=_RESTORE)
+    return got
+
+
+def check_files(root: Path, manifest: Manifest) -> list[str]:
+    """Return one finding for every listed file that fails `verified_sha256`; empty when all pass."""
+    findings = []
+    for name in manifest.files:
+        try:
+            verified_sha256(root, manifest, name)
+        except AssetError as error:
+            findings.append(str(error))
+    return findings
