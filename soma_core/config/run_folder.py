@@ -1,0 +1,95 @@
+"""What a run leaves beside its result: the configuration, the environment and the log."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import json
+import logging
+import os
+import platform
+import sys
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from omegaconf import DictConfig, OmegaConf
+
+from soma_core.cache import atomic_write
+from soma_core.paths import assets_dir
+from soma_core.plugin.registry import default_registry
+
+__all__ = ["describe_environment", "run_log", "write_provenance"]
+
+_log = logging.getLogger(__name__)
+
+
+def _rig_revision() -> str:
+    """Revision of the rig that the assets declare; empty where they are not built."""
+    try:
+        manifest = json.loads((assets_dir() / "MANIFEST.json").read_text(encoding="utf-8"))
+        return str(manifest["rig_revision"])
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        _log.warning("the assets name no rig revision (%s); run: soma assets verify", error)
+        return ""
+
+
+def describe_environment(config: DictConfig, *, command: Sequence[str]) -> dict[str, Any]:
+    """What is needed to run it again: versions, rig, device, seed, SOMA_* variables, command line."""
+    found = {dist.metadata["Name"]: dist.version for dist in importlib.metadata.distributions()}
+    return {
+        "command": list(command),
+        "python": platform.python_version(),
+        "platform": platform.platform(),
+        "rig_revision": _rig_revision(),
+        "device": OmegaConf.select(config, "device", default=None),
+        "seed": OmegaConf.select(config, "seed", default=None),
+        "backends": [
+            {"name": entry.name, "distribution": entry.distribution, "version": entry.version}
+            for entry in default_registry().entries()
+        ],
+        "variables": {key: value for key, value in sorted(os.environ.items()) if key.startswith("SOMA_")},
+        "distributions": dict(sorted(found.items(), key=lambda item: item[0].lower())),
+    }
+
+
+def write_provenance(folder: Path, config: DictConfig, *, command: Sequence[str]) -> None:
+    """Write ``config.yaml`` and ``environment.json`` into `folder`."""
+    text = OmegaConf.to_yaml(config, resolve=True)
+    atomic_write(folder / "config.yaml", lambda path: _write_text(path, text))
+    document = json.dumps(describe_environment(config, command=command), indent=2) + "\n"
+    atomic_write(folder / "environment.json", lambda path: _write_text(path, document))
+
+
+def _write_text(path: Path, text: str) -> None:
+    path.write_text(text, encoding="utf-8")
+
+
+class _OwnRecords(logging.Filter):
+    """Keep what SOMA and its backends say, and the warnings of everybody else."""
+
+    def filter(self, record: logging.LogRecord) -> bool:
+        return record.levelno >= logging.WARNING or record.name.startswith("soma_")
+
+
+@contextmanager
+def run_log(folder: Path) -> Iterator[None]:
+    """Send log records to stderr and to ``log.txt`` in `folder` while the run lasts."""
+    root = logging.getLogger()
+    level = root.level
+    file = logging.FileHandler(folder / "log.txt", encoding="utf-8")
+    file.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(name)s: %(message)s"))
+    terminal = logging.StreamHandler(sys.stderr)
+    terminal.setFormatter(logging.Formatter("%(message)s"))
+    handlers: list[logging.Handler] = [file, terminal]
+    root.setLevel(min(level, logging.INFO))
+    for handler in handlers:
+        handler.addFilter(_OwnRecords())
+        root.addHandler(handler)
+    try:
+        yield
+    finally:
+        for handler in handlers:
+            root.removeHandler(handler)
+            handler.close()
+        root.setLevel(level)

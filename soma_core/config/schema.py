@@ -1,0 +1,169 @@
+"""The schema of each task's configuration: a typo or a wrong type dies before anything runs."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from enum import StrEnum
+from typing import Any
+
+from hydra.core.config_store import ConfigStore
+from omegaconf import MISSING
+
+__all__ = [
+    "AnimateConfig",
+    "BackendChoice",
+    "BenchConfig",
+    "EvaluateConfig",
+    "Experiment",
+    "FrameRange",
+    "Gallery",
+    "Kernels",
+    "Lod",
+    "Picture",
+    "Product",
+    "TrainShapeConfig",
+    "Translation",
+    "register_schemas",
+]
+
+
+class Gallery(StrEnum):
+    """Which identities are animated."""
+
+    one = "one"
+    all = "all"
+
+
+class Kernels(StrEnum):
+    """Which version of the hot path runs."""
+
+    auto = "auto"
+    torch = "torch"
+    warp = "warp"
+
+
+class Lod(StrEnum):
+    """Level of detail of the canonical mesh."""
+
+    mid = "mid"
+    low = "low"
+
+
+class Product(StrEnum):
+    """A file that a run can write."""
+
+    npz = "npz"
+    usd = "usd"
+    glb = "glb"
+    png = "png"
+
+
+class Translation(StrEnum):
+    """Where the body stands."""
+
+    ground = "ground"
+    motion = "motion"
+    none = "none"
+
+
+@dataclass
+class BackendChoice:
+    """An identity: the backend, its parameters (null: the default) and its options."""
+
+    name: str = MISSING
+    params: dict[str, Any] = field(default_factory=dict)
+    options: dict[str, Any] = field(default_factory=dict)
+
+
+@dataclass
+class FrameRange:
+    """A slice of the motion, as in Python: stop is left out, null means to the end."""
+
+    start: int = 0
+    stop: int | None = None
+    step: int = 1
+
+
+@dataclass
+class Picture:
+    """The contact sheet: how many frames, and its width in pixels."""
+
+    frames: int = 5
+    width: int = 1600
+
+
+@dataclass
+class AnimateConfig:
+    """Configuration of ``soma animate``."""
+
+    backend: BackendChoice = field(default_factory=BackendChoice)
+    backends: Gallery = Gallery.one
+    motion: str | None = None
+    motion_fps: float | None = None
+    frames: FrameRange = field(default_factory=FrameRange)
+    translation: Translation = Translation.ground
+    lod: Lod = Lod.mid
+    kernels: Kernels = Kernels.auto
+    device: str = "cpu"
+    seed: int = 0
+    write: list[Product] = field(default_factory=lambda: list(Product))
+    picture: Picture = field(default_factory=Picture)
+
+
+@dataclass
+class TrainShapeConfig:
+    """Configuration of ``soma train-shape``."""
+
+    mix: dict[str, float] = field(default_factory=dict)
+    count: int = 20000
+    components: int = 128
+    batch: int = 512
+    mirror: bool = True
+    held_out: int = 500
+    resume: bool = False
+    seed: int = 0
+    device: str = "cpu"
+    out: str | None = None
+
+
+@dataclass
+class Experiment:
+    """What an evaluation measures, on which backend, over how many identities."""
+
+    name: str = MISSING
+    backend: str = MISSING
+    count: int = 100
+
+
+@dataclass
+class EvaluateConfig:
+    """Configuration of ``soma evaluate``."""
+
+    experiment: Experiment = field(default_factory=Experiment)
+    seed: int = 0
+    device: str = "cpu"
+
+
+@dataclass
+class BenchConfig:
+    """Configuration of ``soma bench``."""
+
+    backend: BackendChoice = field(default_factory=BackendChoice)
+    batches: list[int] = field(default_factory=lambda: [1, 8, 32, 128])
+    kernels: Kernels = Kernels.auto
+    device: str = "cpu"
+    threads: int = 2
+    repeats: int = 20
+    seed: int = 0
+
+
+def register_schemas() -> None:
+    """Make the schemas known to hydra under ``<task>_schema``; safe to call again."""
+    store = ConfigStore.instance()
+    for task, schema in (
+        ("animate", AnimateConfig),
+        ("train_shape", TrainShapeConfig),
+        ("evaluate", EvaluateConfig),
+        ("bench", BenchConfig),
+    ):
+        store.store(name=f"{task}_schema", node=schema)
