@@ -1,0 +1,198 @@
+"""A skinned animation ready for export: one identity, its T-pose skeleton and local transforms over time."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from soma_core.errors import InputError
+from soma_core.rig.mesh import CanonicalMesh
+from soma_core.rig.skeleton import Rig
+
+if TYPE_CHECKING:
+    from soma_core.skeleton.identity import Identity
+
+__all__ = ["BODY_COLOUR", "SkinnedClip", "linear_colour", "skinned_clip", "vertex_normals"]
+
+BODY_COLOUR = (0.80, 0.66, 0.58)
+"""sRGB colour of a body that has no other."""
+
+_BONE_TOLERANCE = 1e-6
+"""Change of a bone relative to the size of the scene that counts as float32 rounding of the transforms."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class SkinnedClip:
+    """What the exporters write. Metres, +Y up, column vectors, quaternions ``xyzw``.
+
+    Attributes:
+        mesh: topology and UVs.
+        rig: joint names, parents and weights.
+        rest: bind shape of the identity, (v, 3) float64 [m].
+        bind_world: (J, 4, 4) float64 world transforms at `rest` [m].
+        t_pose_world: (J, 4, 4) float64 world transforms of the identity's T-pose [m].
+        translations: (frames, J, 3) float64 local translations [m].
+        quaternions: (frames, J, 4) float64 local rotations, continuous in time.
+        fps: frames per second.
+        name: name of the body in the file.
+        colour: sRGB colour in 0..1.
+        metadata: texts stored in the file (licence, backend, rig revision, ...).
+    """
+
+    mesh: CanonicalMesh
+    rig: Rig
+    rest: np.ndarray
+    bind_world: np.ndarray
+    t_pose_world: np.ndarray
+    translations: np.ndarray
+    quaternions: np.ndarray
+    fps: float
+    name: str = "Body"
+    colour: tuple[float, float, float] = BODY_COLOUR
+    metadata: Mapping[str, str] = field(default_factory=dict)
+
+    @property
+    def frame_count(self) -> int:
+        """Number of frames."""
+        return len(self.translations)
+
+    def t_pose_local(self) -> np.ndarray:
+        """Local transforms of the T-pose, (J, 4, 4) [m]."""
+        return _to_local(self.t_pose_world[None], self.rig.parents)[0]
+
+    def influences(self) -> tuple[np.ndarray, np.ndarray]:
+        """Joint ids (v, k) int and weights (v, k) float32 of every influence, heaviest first, zero padded."""
+        weights = self.rig.weights.tocsr()
+        counts = np.diff(weights.indptr)
+        rows = np.repeat(np.arange(len(counts)), counts)
+        order = np.lexsort((-weights.data, rows))
+        slots = np.arange(len(rows)) - np.repeat(weights.indptr[:-1], counts)
+        joint_ids = np.zeros((len(counts), int(counts.max())), np.int64)
+        values = np.zeros(joint_ids.shape)
+        joint_ids[rows, slots] = weights.indices[order]
+        values[rows, slots] = weights.data[order]
+        return joint_ids, (values / values.sum(axis=1, keepdims=True)).astype(np.float32)
+
+
+def skinned_clip(
+    mesh: CanonicalMesh,
+    rig: Rig,
+    identity: Identity,
+    transforms: Any,
+    *,
+    fps: float,
+    name: str = "Body",
+    colour: tuple[float, float, float] = BODY_COLOUR,
+    metadata: Mapping[str, str] | None = None,
+) -> SkinnedClip:
+    """Gather what the exporters need from one identity and its posed world transforms.
+
+    Args:
+        mesh: canonical mesh at the level of detail of `identity`.
+        rig: canonical rig at the same level of detail.
+        identity: one identity (batch size 1).
+        transforms: ``Posed.transforms``, (frames, J, 4, 4) world transforms [m], tensor or array.
+        fps: frames per second.
+        name: name of the body in the file.
+        colour: sRGB colour in 0..1.
+        metadata: texts to store in the file.
+
+    Raises:
+        InputError: a shape does not fit the rig, or the identity is a batch.
+    """
+    joints, vertices = rig.joint_count, mesh.vertex_count
+    rest = _array("identity.rest", identity.rest, (1, vertices, 3))[0]
+    bind_world = _array("identity.bind_world", identity.bind_world, (1, joints, 4, 4))[0]
+    world = _array("transforms", transforms, (len(transforms), joints, 4, 4))
+    t_pose = _t_pose(rig, bind_world)
+    local = _to_local(world, rig.parents)
+    return SkinnedClip(
+        mesh=mesh,
+        rig=rig,
+        rest=rest,
+        bind_world=bind_world,
+        t_pose_world=t_pose,
+        translations=_steady(local[..., :3, 3], _to_local(t_pose[None], rig.parents)[0, :, :3, 3], world),
+        quaternions=_continuous(local[..., :3, :3]),
+        fps=float(fps),
+        name=name,
+        colour=colour,
+        metadata=dict(metadata or {}),
+    )
+
+
+def _array(argument: str, value: Any, shape: tuple[int, ...]) -> np.ndarray:
+    """Float64 array of a tensor or array; refuses another shape."""
+    array = np.asarray(value.detach().cpu() if hasattr(value, "detach") else value, np.float64)
+    if array.shape != shape or not np.isfinite(array).all():
+        raise InputError(
+            argument,
+            got=f"shape {array.shape}, {int((~np.isfinite(array)).sum())} not finite",
+            expected=f"finite numbers of shape {shape}",
+            fix="Pass one identity and transforms of the same rig and level of detail.",
+        )
+    return array
+
+
+def _t_pose(rig: Rig, bind_world: np.ndarray) -> np.ndarray:
+    """T-pose of an identity: the rig's T-pose rotations on the identity's own bones."""
+    bones = _to_local(bind_world[None], rig.parents)[0, :, :3, 3]
+    world = np.tile(np.eye(4), (rig.joint_count, 1, 1))
+    world[:, :3, :3] = rig.t_pose_world[:, :3, :3]
+    for joint, parent in enumerate(rig.parents):
+        if parent < 0:
+            world[joint, :3, 3] = bind_world[joint, :3, 3]
+            continue
+        # Hips hang on the unrotated Root, so their bind position is also their T-pose position.
+        world[joint, :3, 3] = world[parent, :3, :3] @ bones[joint] + world[parent, :3, 3]
+    return world
+
+
+def _to_local(world: np.ndarray, parents: np.ndarray) -> np.ndarray:
+    """Local transforms of world transforms (frames, J, 4, 4)."""
+    local = world.copy()
+    rotation, position = world[..., :3, :3], world[..., :3, 3]
+    child = np.flatnonzero(parents >= 0)
+    parent = parents[child]
+    to_parent = np.swapaxes(rotation[:, parent], -1, -2)
+    offset = position[:, child] - position[:, parent]
+    local[:, child, :3, :3] = to_parent @ rotation[:, child]
+    local[..., :3, 3][:, child] = np.einsum("fjab,fjb->fja", to_parent, offset)
+    return local
+
+
+def _steady(translations: np.ndarray, rest: np.ndarray, world: np.ndarray) -> np.ndarray:
+    """Replace bones that only jitter by rounding with their length at rest."""
+    size = 1.0 + np.abs(world[..., :3, 3]).max()
+    still = np.abs(translations - rest).max(axis=(0, 2)) < _BONE_TOLERANCE * size
+    return np.where(still[None, :, None], rest[None], translations)
+
+
+def _continuous(rotations: np.ndarray) -> np.ndarray:
+    """Quaternions xyzw (frames, J, 4) without sign flips between frames, so that players interpolate."""
+    flat = Rotation.from_matrix(rotations.reshape(-1, 3, 3)).as_quat(canonical=True)
+    quaternions = flat.reshape(*rotations.shape[:2], 4)
+    flips = (quaternions[1:] * quaternions[:-1]).sum(-1) < 0
+    signs = np.concatenate([np.ones_like(flips[:1], float), np.where(flips, -1.0, 1.0)])[: len(quaternions)]
+    return quaternions * np.cumprod(signs, axis=0)[..., None]
+
+
+def vertex_normals(vertices: np.ndarray, triangles: np.ndarray) -> np.ndarray:
+    """Area-weighted unit vertex normals, (v, 3); +Y where a vertex has no area."""
+    corners = vertices[triangles]
+    faces = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    ids = triangles.reshape(-1)
+    weights = np.repeat(faces, 3, axis=0)
+    normals = np.stack([np.bincount(ids, weights[:, axis], len(vertices)) for axis in range(3)], axis=1)
+    length = np.linalg.norm(normals, axis=1, keepdims=True)
+    return np.where(length > 0, normals / np.where(length > 0, length, 1), (0.0, 1.0, 0.0))
+
+
+def linear_colour(colour: tuple[float, float, float]) -> tuple[float, float, float]:
+    """Linear-light value of an sRGB colour, which is what USD and glTF materials store."""
+    red, green, blue = ((c + 0.055) ** 2.4 / 1.055**2.4 if c > 0.04045 else c / 12.92 for c in colour)
+    return red, green, blue

@@ -1,0 +1,163 @@
+"""Write a skinned animation as a UsdSkel file."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from soma_core.cache import atomic_write
+from soma_core.errors import InputError
+from soma_core.io.clip import SkinnedClip, linear_colour, vertex_normals
+
+__all__ = ["write_usd"]
+
+_SUFFIXES = (".usdc", ".usda", ".usd")
+
+
+def write_usd(path: str | Path, clip: SkinnedClip) -> None:
+    """Write `clip` as UsdSkel: metres, +Y up, one time code a frame, the T-pose as rest.
+
+    The skeleton holds the identity's bind and T-pose transforms, the animation is separate from them, and
+    the mesh keeps every skin influence and its UVs. `clip.metadata` goes to the layer's custom data.
+
+    Args:
+        path: ``.usdc`` (binary, a third of the size), ``.usda`` (text) or ``.usd``.
+        clip: what to write.
+
+    Raises:
+        InputError: the suffix is none of these.
+    """
+    path = Path(path)
+    if path.suffix not in _SUFFIXES:
+        raise InputError(
+            "path", got=repr(path.name), expected=" or ".join(_SUFFIXES), fix="Change the suffix."
+        )
+    stage = _stage(clip)
+    atomic_write(path, lambda temporary: _export(stage, temporary))
+
+
+def _export(stage: Any, path: Path) -> None:
+    if not stage.Export(str(path)):
+        raise OSError(f"usd-core could not write {path}")
+
+
+def _stage(clip: SkinnedClip) -> Any:
+    """Build the stage in memory."""
+    from pxr import Usd, UsdGeom, UsdSkel
+
+    stage = Usd.Stage.CreateInMemory()
+    UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.y)
+    UsdGeom.SetStageMetersPerUnit(stage, 1.0)
+    stage.SetTimeCodesPerSecond(clip.fps)
+    stage.SetFramesPerSecond(clip.fps)
+    stage.SetStartTimeCode(0)
+    stage.SetEndTimeCode(clip.frame_count - 1)
+    stage.GetRootLayer().customLayerData = {"soma_core": dict(clip.metadata)}
+    root = UsdSkel.Root.Define(stage, f"/{_identifier(clip.name)}")
+    stage.SetDefaultPrim(root.GetPrim())
+    scope = str(root.GetPath())
+    _add_skeleton(stage, f"{scope}/Skeleton", clip)
+    mesh = _add_mesh(stage, f"{scope}/Mesh", clip)
+    _bind(mesh, f"{scope}/Skeleton", clip)
+    _add_material(stage, mesh, f"{scope}/Material", clip)
+    return stage
+
+
+def _identifier(name: str) -> str:
+    from pxr import Tf
+
+    return Tf.MakeValidIdentifier(name)
+
+
+def _joint_paths(clip: SkinnedClip) -> list[str]:
+    """UsdSkel names a joint by its path from the root joint."""
+    paths: list[str] = []
+    for name, parent in zip(clip.rig.joint_names, clip.rig.parents, strict=True):
+        paths.append(name if parent < 0 else f"{paths[parent]}/{name}")
+    return paths
+
+
+def _matrices(transforms: np.ndarray) -> Any:
+    """USD matrices of column-vector transforms: USD multiplies row vectors, hence the transpose."""
+    from pxr import Gf, Vt
+
+    return Vt.Matrix4dArray([Gf.Matrix4d(*matrix.T.reshape(-1).tolist()) for matrix in transforms])
+
+
+def _add_skeleton(stage: Any, path: str, clip: SkinnedClip) -> None:
+    from pxr import Gf, UsdSkel, Vt
+
+    skeleton = UsdSkel.Skeleton.Define(stage, path)
+    joints = _joint_paths(clip)
+    skeleton.CreateJointsAttr(joints)
+    skeleton.CreateBindTransformsAttr(_matrices(clip.bind_world))
+    skeleton.CreateRestTransformsAttr(_matrices(clip.t_pose_local()))
+    animation = UsdSkel.Animation.Define(stage, f"{path}/Animation")
+    animation.CreateJointsAttr(joints)
+    animation.CreateScalesAttr(Vt.Vec3hArray([Gf.Vec3h(1, 1, 1)] * len(joints)))
+    translations = animation.CreateTranslationsAttr()
+    rotations = animation.CreateRotationsAttr()
+    for frame in range(clip.frame_count):
+        translations.Set(Vt.Vec3fArray.FromNumpy(clip.translations[frame].astype(np.float32)), frame)
+        quaternions = [Gf.Quatf(w, x, y, z) for x, y, z, w in clip.quaternions[frame].tolist()]
+        rotations.Set(Vt.QuatfArray(quaternions), frame)
+    UsdSkel.BindingAPI.Apply(skeleton.GetPrim()).CreateAnimationSourceRel().SetTargets([animation.GetPath()])
+
+
+def _add_mesh(stage: Any, path: str, clip: SkinnedClip) -> Any:
+    from pxr import Sdf, UsdGeom, Vt
+
+    mesh = UsdGeom.Mesh.Define(stage, path)
+    points = clip.rest.astype(np.float32)
+    mesh.CreatePointsAttr(Vt.Vec3fArray.FromNumpy(points))
+    mesh.CreateExtentAttr(Vt.Vec3fArray.FromNumpy(np.stack([points.min(axis=0), points.max(axis=0)])))
+    mesh.CreateFaceVertexCountsAttr(_ints(clip.mesh.face_vert_counts))
+    mesh.CreateFaceVertexIndicesAttr(_ints(clip.mesh.face_vert_indices))
+    mesh.CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)
+    normals = vertex_normals(clip.rest, clip.mesh.triangles).astype(np.float32)
+    mesh.CreateNormalsAttr(Vt.Vec3fArray.FromNumpy(normals))
+    mesh.SetNormalsInterpolation(UsdGeom.Tokens.vertex)
+    if len(clip.mesh.uv):
+        primvars = UsdGeom.PrimvarsAPI(mesh)
+        kind = Sdf.ValueTypeNames.TexCoord2fArray
+        st = primvars.CreatePrimvar("st", kind, UsdGeom.Tokens.faceVarying)
+        st.Set(Vt.Vec2fArray.FromNumpy(np.ascontiguousarray(clip.mesh.uv, np.float32)))
+        st.SetIndices(_ints(clip.mesh.uv_indices))
+    return mesh
+
+
+def _ints(values: np.ndarray) -> Any:
+    from pxr import Vt
+
+    return Vt.IntArray.FromNumpy(np.ascontiguousarray(values, np.int32))
+
+
+def _bind(mesh: Any, skeleton: str, clip: SkinnedClip) -> None:
+    """Tie the mesh to the skeleton with every influence."""
+    from pxr import Gf, UsdSkel, Vt
+
+    joint_ids, weights = clip.influences()
+    width = joint_ids.shape[1]
+    binding = UsdSkel.BindingAPI.Apply(mesh.GetPrim())
+    binding.CreateSkeletonRel().SetTargets([skeleton])
+    binding.CreateGeomBindTransformAttr(Gf.Matrix4d(1.0))
+    binding.CreateJointIndicesPrimvar(constant=False, elementSize=width).Set(_ints(joint_ids.reshape(-1)))
+    binding.CreateJointWeightsPrimvar(constant=False, elementSize=width).Set(
+        Vt.FloatArray.FromNumpy(weights.reshape(-1))
+    )
+
+
+def _add_material(stage: Any, mesh: Any, path: str, clip: SkinnedClip) -> None:
+    from pxr import Gf, Sdf, UsdShade
+
+    colour = Gf.Vec3f(*linear_colour(clip.colour))
+    mesh.CreateDisplayColorAttr([colour])
+    material = UsdShade.Material.Define(stage, path)
+    shader = UsdShade.Shader.Define(stage, f"{path}/Surface")
+    shader.CreateIdAttr("UsdPreviewSurface")
+    shader.CreateInput("diffuseColor", Sdf.ValueTypeNames.Color3f).Set(colour)
+    shader.CreateInput("roughness", Sdf.ValueTypeNames.Float).Set(0.6)
+    material.CreateSurfaceOutput().ConnectToSource(shader.ConnectableAPI(), "surface")
+    UsdShade.MaterialBindingAPI.Apply(mesh.GetPrim()).Bind(material)
