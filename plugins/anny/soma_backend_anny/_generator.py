@@ -1,0 +1,136 @@
+"""The Anny generator: phenotypes and local changes in, rest mesh out."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from soma_backend_anny import _basis
+from soma_backend_anny._phenotypes import macro_weights
+from soma_core.errors import InputError
+from soma_core.plugin.spec import BackendSpec, LinearBasis
+
+__all__ = ["AnnyGenerator", "signed_parts"]
+
+_PHENOTYPE_SETS = {"all": _basis.PHENOTYPES, "default": _basis.DEFAULT_PHENOTYPES}
+
+
+class AnnyGenerator:
+    """Rest shapes [m], +Z up, facing -Y, 13,718 vertices; linear in the coefficients of a compact basis.
+
+    Args:
+        spec: the declaration, for the names of the local changes.
+        device: where the tensors live.
+        dtype: floating type of the tensors.
+        options: see :class:`soma_backend_anny.AnnyOptions`.
+
+    Raises:
+        InputError: an option has an unknown value.
+    """
+
+    def __init__(
+        self, spec: BackendSpec, *, device: torch.device, dtype: torch.dtype, options: Mapping[str, Any]
+    ) -> None:
+        self._phenotypes = _phenotype_set(options.get("phenotypes", "all"))
+        declared = [parameter.name for parameter in spec.params if parameter.group == "local_changes"]
+        self._local_changes = _enabled_local_changes(options.get("local_changes", "none"), declared)
+        stored = _basis.load_phenotype_basis(self._phenotypes)
+        rank = int((stored.remaining_mm > float(options.get("tolerance_mm", 1e-5))).sum())
+        rows = [stored.basis[:rank]]
+        if self._local_changes:
+            rows.append(_basis.load_local_changes(self._local_changes))
+
+        def tensor(array: np.ndarray) -> Tensor:
+            return torch.from_numpy(array).to(device=device, dtype=dtype)
+
+        self._template = tensor(stored.template)
+        self._basis = tensor(np.concatenate(rows) if len(rows) > 1 else rows[0])
+        self._projection = tensor(stored.projection[:, :rank])
+        self._offset = tensor(stored.offset[:rank])
+
+    def rest(self, params: Mapping[str, Tensor]) -> Tensor:
+        """Rest vertices (batch, 13718, 3) [m]; differentiable in every parameter.
+
+        Parameters that are absent count as their default.
+
+        Raises:
+            InputError: a parameter that the options did not enable.
+        """
+        motion = self._coefficients(params) @ self._basis.flatten(1)
+        return self._template + motion.unflatten(-1, self._template.shape)
+
+    def linear_basis(self) -> LinearBasis:
+        """The template with every phenotype at 0.5, the basis, and the map from parameters to it."""
+        return LinearBasis(template=self._template, basis=self._basis, coefficients=self._coefficients)
+
+    def _coefficients(self, params: Mapping[str, Tensor]) -> Tensor:
+        """Coefficients (batch, k) of the basis; zero when every parameter has its default."""
+        self._check_enabled(params)
+        batch = next((len(value) for value in params.values()), 1)
+        middle = self._template.new_full((batch,), 0.5)
+        phenotypes = {name: params.get(name, middle) for name in _basis.PHENOTYPES}
+        coefficients = macro_weights(phenotypes) @ self._projection + self._offset
+        if not self._local_changes:
+            return coefficients
+        default = self._template.new_zeros(batch)
+        values = torch.stack([params.get(name, default) for name in self._local_changes], dim=-1)
+        return torch.cat((coefficients, signed_parts(values)), dim=-1)
+
+    def _check_enabled(self, params: Mapping[str, Tensor]) -> None:
+        enabled = {*self._phenotypes, *self._local_changes}
+        for name in params:
+            if name in enabled:
+                continue
+            local = name not in _basis.PHENOTYPES
+            option = f"local_changes: [{name}]" if local else "phenotypes: all"
+            current = f"{len(self._local_changes)} local changes" if local else "the six default phenotypes"
+            raise InputError(
+                f"params[{name!r}]",
+                got=f"{name!r}, but the Anny backend was built with {current}",
+                expected="a parameter that the backend's options enable",
+                fix=f"Build it with the option {option} (local_changes: all enables every local change).",
+            )
+
+
+def signed_parts(values: Tensor) -> Tensor:
+    """Split (batch, n) into (batch, 2n): the part above zero and the part below, in turn.
+
+    At zero both parts follow the value (derivatives +1 and -1), so that a fit can leave it.
+    """
+    zero = torch.zeros_like(values)
+    above = torch.where(values >= 0, values, zero)
+    below = torch.where(values <= 0, -values, zero)
+    return torch.stack((above, below), dim=-1).flatten(1)
+
+
+def _phenotype_set(value: object) -> tuple[str, ...]:
+    if not isinstance(value, str) or value not in _PHENOTYPE_SETS:
+        raise InputError(
+            "options.phenotypes",
+            got=repr(value),
+            expected=f"one of {', '.join(_PHENOTYPE_SETS)}",
+            fix="Use all, or default for the six main phenotypes.",
+        )
+    return _PHENOTYPE_SETS[value]
+
+
+def _enabled_local_changes(value: object, declared: Sequence[str]) -> tuple[str, ...]:
+    if value is None or value == "none":
+        return ()
+    if value == "all":
+        return tuple(declared)
+    names = list(value) if isinstance(value, Sequence) and not isinstance(value, str) else [value]
+    unknown = [name for name in names if name not in declared]
+    if unknown:
+        raise InputError(
+            "options.local_changes",
+            got=repr(unknown[0]),
+            expected="none, all, or a list of names of local changes",
+            fix="`soma backends show anny` lists the names.",
+        )
+    wanted = set(names)
+    return tuple(name for name in declared if name in wanted)
