@@ -25,6 +25,9 @@ from soma_core.plugin.registry import default_registry
 
 __all__ = ["Task", "run_task"]
 
+_SHOWN_KEYS = 16
+"""A backend may have hundreds of parameters; an error message lists this many."""
+
 Task: TypeAlias = Callable[[DictConfig, Path], None]
 
 
@@ -137,12 +140,12 @@ def _refused_value(cause: OmegaConfBaseException) -> InputError:
         return _wrong_type(name, _first_line(cause))
     parent, _, key = name.rpartition(".")
     known = [str(item) for item in cause.parent_node or () if item != "hydra"]
-    close = did_you_mean(key, known)
+    shown = known[:_SHOWN_KEYS] + [f"{len(known) - _SHOWN_KEYS} more"] * (len(known) > _SHOWN_KEYS)
     return InputError(
         name,
         got="an unknown key",
-        expected=f"one of {', '.join(known) or 'no keys'}" + (f" in {parent}" if parent else ""),
-        fix=close or "See --help",
+        expected=f"one of {', '.join(shown) or 'no keys'}" + (f" in {parent}" if parent else ""),
+        fix=did_you_mean(key, known) or "See --help",
     )
 
 

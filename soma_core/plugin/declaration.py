@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import difflib
+import re
 from collections.abc import Iterable, Mapping
 from typing import Any, get_args
 
@@ -11,6 +12,8 @@ from soma_core.errors import InputError
 from soma_core.plugin.spec import Axis, BackendSpec, FileNeeded, Parameter, Unit, WrapPair
 
 __all__ = ["checked_options", "did_you_mean", "spec_problem"]
+
+_NAME = re.compile(r"[A-Za-z_][A-Za-z0-9_-]*")
 
 
 def did_you_mean(name: str, known: Iterable[str]) -> str:
@@ -36,8 +39,8 @@ def _params_problem(params: object) -> str | None:
     if twice:
         return f"params declares {', '.join(twice)} more than once"
     for item in params:
-        if not item.name.isidentifier():
-            return f"the parameter name {item.name!r} is not an identifier"
+        if not _NAME.fullmatch(item.name):
+            return f"the parameter name {item.name!r} is no key; use letters, digits, _ and -"
         if not item.range[0] < item.range[1]:
             return f"the range of parameter {item.name} is {item.range}, expected (low, high) with low < high"
     return None
