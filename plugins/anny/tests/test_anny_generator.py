@@ -42,10 +42,9 @@ def random_params(seed, batch=5, names=PHENOTYPES):
 
 
 def test_declaring_imports_neither_torch_nor_anny():
-    code = "import sys, soma_backend_anny as b; b.soma_backend(); print([m for m in ('torch','anny') if m in sys.modules])"
-    done = subprocess.run(
-        [sys.executable, "-W", "error", "-c", code], capture_output=True, text=True, check=True
-    )
+    code = "import sys, soma_backend_anny as b; b.soma_backend(); print({'torch', 'anny'} & {*sys.modules})"
+    command = [sys.executable, "-W", "error", "-c", code]
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
     assert (done.stdout.strip(), done.stderr) == ("set()", "")
 
 
