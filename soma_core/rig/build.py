@@ -13,6 +13,7 @@ import scipy.sparse
 
 from soma_core.cache import atomic_write, file_sha256
 from soma_core.errors import AssetError
+from soma_core.rig.compression import compress_shape_space
 from soma_core.rig.manifest import NEUTRAL_NAME, RIG_NAME, Manifest, write_manifest
 from soma_core.rig.neutral import SEGMENT_NAMES, ShapeSpace, load_shape_space, write_neutral
 from soma_core.rig.revision import REVISION_DIGITS, rig_hash
@@ -58,7 +59,6 @@ def _derive(source: SourceRig) -> _Built:
             triangles=source.triangles,
             weights=source.weights,
             joint_names=source.joint_names,
-            joint_positions=source.bind_world[:, :3, 3],
             mirror=mirror,
             face_interior=source.face_interior,
         )
@@ -130,7 +130,7 @@ def _usda(built: _Built) -> str:
         rest_local=built.rest_local,
         meshes=[_skin(built, "mid"), _skin(built, "low")],
         notes={"licence": _LICENCE, "origin": _ORIGIN, "rig_hash": built.rig_hash},
-        comment="Canonical SOMA rig with 78 joints; restTransforms hold the T-pose. Written by soma assets build.",
+        comment="Canonical SOMA rig; restTransforms hold the T-pose. Written by soma assets build.",
     )
 
 
@@ -148,6 +148,10 @@ def _metadata(built: _Built) -> dict[str, Any]:
     }
 
 
+def _revision(built: _Built) -> str:
+    return built.rig_hash[:REVISION_DIGITS]
+
+
 def _bind_only(built: _Built) -> ShapeSpace:
     """The shape space before any training: the bind shape and no directions."""
     mean = built.source.bind_shape.astype(np.float32)
@@ -159,10 +163,6 @@ def _bind_only(built: _Built) -> ShapeSpace:
     )
 
 
-def _revision(built: _Built) -> str:
-    return built.rig_hash[:REVISION_DIGITS]
-
-
 def _shape_space(built: _Built, output: Path, trained: Path | None) -> ShapeSpace:
     """The trained space to merge: the given one, else the one already in `output`, else none."""
     path = trained if trained is not None else output / NEUTRAL_NAME
@@ -171,7 +171,8 @@ def _shape_space(built: _Built, output: Path, trained: Path | None) -> ShapeSpac
     space = load_shape_space(path)
     revision = space.metadata.get("rig_revision", _revision(built))
     if revision == _revision(built) and len(space.mean) == len(built.source.bind_shape):
-        return space
+        # A kept space was rounded when it was merged; its stated error stays true.
+        return space if trained is None else compress_shape_space(space)
     if trained is None:
         _log.warning("%s holds a shape space of rig %s; leaving it out", path, revision)
         return _bind_only(built)

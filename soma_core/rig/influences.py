@@ -10,13 +10,12 @@ import numpy as np
 import scipy.sparse
 
 from soma_core.errors import AssetError
+from soma_core.rig.stored import refuse_bad_weights
 
 if TYPE_CHECKING:
     from pxr import Usd
 
-__all__ = ["ROW_SUM_TOLERANCE", "read_weights"]
-
-ROW_SUM_TOLERANCE = 1e-4  # float32 weights of up to 14 influences, with room for other exporters
+__all__ = ["read_weights"]
 
 
 def _joint_map(path: Path, skin: Usd.Prim, joint_paths: Sequence[str]) -> np.ndarray:
@@ -59,31 +58,21 @@ def read_weights(
 
     Raises:
         AssetError: unknown joints, wrong counts, indices out of range, or weights that are
-            negative, not finite or do not sum to 1 within `ROW_SUM_TOLERANCE`.
+            negative, not finite or do not sum to 1.
     """
-    fix = "Normalise the skin weights and export again"
     joints = _joint_map(path, skin, joint_paths)
     indices = _per_vertex(path, skin, "skel:jointIndices", vertex_count)
     values = _per_vertex(path, skin, "skel:jointWeights", vertex_count).astype(np.float64)
     if indices.shape != values.shape:
         cause = f"jointIndices and jointWeights have elementSize {indices.shape[1]} and {values.shape[1]}"
         raise AssetError(path, cause=cause, fix="Export the skin weights again")
-    if not np.isfinite(values).all():
-        vertex = int(np.argwhere(~np.isfinite(values))[0, 0])
-        raise AssetError(path, cause=f"skin weights of vertex {vertex} are NaN or infinite", fix=fix)
-    if values.min() < 0:
-        vertex = int(np.argwhere(values < 0)[0, 0])
-        raise AssetError(path, cause=f"vertex {vertex} has a negative skin weight {values.min():.6g}", fix=fix)
-    used = values > 0
+    used = values != 0
     outside = used & ((indices < 0) | (indices >= len(joints)))
     if outside.any():
         cause = f"jointIndices holds {int(indices[outside][0])}, but the mesh has {len(joints)} joints"
         raise AssetError(path, cause=cause, fix="Export the skin weights again")
-    error = np.abs(values.sum(axis=1) - 1)
-    if error.max() > ROW_SUM_TOLERANCE:
-        vertex = int(error.argmax())
-        cause = f"skin weights of vertex {vertex} sum to {values[vertex].sum():.6g}, expected 1"
-        raise AssetError(path, cause=cause, fix=fix)
     rows = np.nonzero(used)[0]
     entries = (values[used], (rows, joints[indices[used]]))
-    return scipy.sparse.csr_array(scipy.sparse.coo_array(entries, shape=(vertex_count, len(joint_paths))))
+    weights = scipy.sparse.csr_array(scipy.sparse.coo_array(entries, shape=(vertex_count, len(joint_paths))))
+    refuse_bad_weights(path, weights)
+    return weights

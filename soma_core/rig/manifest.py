@@ -58,7 +58,8 @@ def refuse_unreadable(path: Path) -> None:
     if not head:
         raise AssetError(path, cause="file is empty", fix=_RESTORE)
     if head.startswith(b"version https://git-lfs"):
-        raise AssetError(path, cause="file is a git-LFS pointer, not the data", fix="Fetch it with `git lfs pull`")
+        cause = "file is a git-LFS pointer, not the data"
+        raise AssetError(path, cause=cause, fix="Fetch it with `git lfs pull`")
 
 
 def read_manifest(root: Path) -> Manifest:

@@ -21,6 +21,7 @@ __all__ = [
     "TOPOLOGY_KEYS",
     "ShapeSpace",
     "load_shape_space",
+    "read_arrays",
     "read_topology",
     "write_neutral",
 ]
@@ -108,7 +109,7 @@ class ShapeSpace:
         return len(self.eigenvalues)
 
 
-def _read_arrays(path: Path, names: Iterable[str]) -> dict[str, np.ndarray]:
+def read_arrays(path: Path, names: Iterable[str]) -> dict[str, np.ndarray]:
     """Read the named arrays of an npz, and `metadata` where present; other keys stay unread.
 
     Raises:
@@ -150,7 +151,7 @@ def read_topology(path: Path) -> dict[str, np.ndarray]:
     Raises:
         AssetError: unreadable file, missing keys, or metadata of another unit or axis.
     """
-    arrays = _read_arrays(path, TOPOLOGY_KEYS)
+    arrays = read_arrays(path, TOPOLOGY_KEYS)
     _read_metadata(path, arrays)
     return {name: arrays[name] for name in TOPOLOGY_KEYS}
 
@@ -169,7 +170,7 @@ def load_shape_space(path: Path | str | None = None) -> ShapeSpace:
         verified_sha256(root, read_manifest(root), NEUTRAL_NAME)
         path = root / NEUTRAL_NAME
     path = Path(path)
-    arrays = _read_arrays(path, _SHAPE_KEYS)
+    arrays = read_arrays(path, _SHAPE_KEYS)
     metadata = _read_metadata(path, arrays)
     provenance = metadata.get("provenance")
     trained = provenance.get("shape_space") if isinstance(provenance, dict) else None

@@ -26,12 +26,11 @@ _TORSO = ("Hips", "Spine1", "Spine2", "Chest", "LeftShoulder", "RightShoulder")
 _TOE_GAP = 1.0  # cm along the normal
 _TOE_ASIDE = 0.35  # cm across it: about the spacing of the vertices
 _TOE_FACING = -0.3  # cosine between the two normals
+_TOE_CLOSING = 2  # rings taken in where at least half of the neighbours belong already
 
-# The armpit is the hollow under the shoulder joint, where arm and chest share the skin.
-_ARMPIT_SHARE = 0.08  # least weight on either side
-_ARMPIT_REACH = 9.0  # cm from the point below the shoulder joint
-_ARMPIT_DROP = 7.0  # cm from the shoulder joint down to that point
-_ARMPIT_CONVEXITY = 0.0
+# The armpit is the hollow under the arm: the skin around the point that faces straight down.
+_ARMPIT_SHARE = 0.1  # least weight of arm and of trunk at that point
+_ARMPIT_RADIUS = 6.0  # cm
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -43,7 +42,6 @@ class RiggedMesh:
         triangles: (t, 3).
         weights: (v, J) dense.
         joint_names: J names.
-        joint_positions: (J, 3) at bind [cm].
         mirror: (v,) left/right partners.
         face_interior: ids of the mouth bag and the eye bags.
     """
@@ -52,7 +50,6 @@ class RiggedMesh:
     triangles: np.ndarray
     weights: np.ndarray
     joint_names: tuple[str, ...]
-    joint_positions: np.ndarray
     mirror: np.ndarray
     face_interior: np.ndarray
 
@@ -69,16 +66,18 @@ class RiggedMesh:
             np.add.at(normals, self.triangles[:, corner], faces)
         return normals / np.linalg.norm(normals, axis=1, keepdims=True)
 
+    def adjacency(self) -> scipy.sparse.csr_array:
+        """Which vertices share an edge: (v, v), entries 1."""
+        pairs = np.concatenate([self.triangles[:, [i, (i + 1) % 3]] for i in range(3)])
+        count = len(self.vertices)
+        # Every edge of a closed, oriented mesh appears once in each direction.
+        return scipy.sparse.csr_array((np.ones(len(pairs)), tuple(pairs.T)), shape=(count, count))
+
 
 def _interior_parts(mesh: RiggedMesh) -> tuple[np.ndarray, np.ndarray]:
     """Split the face interior into the mouth bag (the largest component) and the two eye bags."""
-    count = len(mesh.vertices)
-    inside = np.zeros(count, bool)
-    inside[mesh.face_interior] = True
-    pairs = np.concatenate([mesh.triangles[:, [0, 1]], mesh.triangles[:, [1, 2]], mesh.triangles[:, [2, 0]]])
-    pairs = pairs[inside[pairs].all(axis=1)]
-    graph = scipy.sparse.coo_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(count, count))
-    labels = connected_components(graph, directed=False)[1][mesh.face_interior]
+    graph = mesh.adjacency()[mesh.face_interior][:, mesh.face_interior]
+    labels = connected_components(graph, directed=False)[1]
     names, sizes = np.unique(labels, return_counts=True)
     if len(names) != 3:
         raise InputError(
@@ -102,18 +101,21 @@ def _between_toes(mesh: RiggedMesh, normals: np.ndarray) -> np.ndarray:
         facing = normals[ids] @ normals[ids].T
         close = (along > 0) & (along < _TOE_GAP) & (aside < _TOE_ASIDE) & (facing < _TOE_FACING)
         found[ids[close.any(axis=1)]] = True
+    # The web at the bottom of a gap faces nothing: take in what the two walls enclose.
+    adjacency = mesh.adjacency()
+    for _ in range(_TOE_CLOSING):
+        found |= adjacency @ found >= _MAJORITY * adjacency.sum(axis=1)
     return found
 
 
-def _armpits(mesh: RiggedMesh) -> np.ndarray:
-    """Skin shared by arm and trunk in the hollow below each shoulder joint."""
+def _armpits(mesh: RiggedMesh, normals: np.ndarray) -> np.ndarray:
+    """Skin around the highest point of the hollow between each arm and the trunk."""
     found = np.zeros(len(mesh.vertices), bool)
     trunk = mesh.share(("Spine1", "Spine2", "Chest"))
     for side in ("Left", "Right"):
-        hollow = mesh.joint_positions[mesh.joint_names.index(f"{side}Arm")] - (0.0, _ARMPIT_DROP, 0.0)
-        near = np.linalg.norm(mesh.vertices - hollow, axis=1) < _ARMPIT_REACH
         shared = (mesh.share([f"{side}Arm"]) > _ARMPIT_SHARE) & (trunk > _ARMPIT_SHARE)
-        found |= near & shared
+        apex = mesh.vertices[np.where(shared, normals[:, 1], np.inf).argmin()]
+        found |= np.linalg.norm(mesh.vertices - apex, axis=1) < _ARMPIT_RADIUS
     return found
 
 
@@ -135,7 +137,7 @@ def label_segments(mesh: RiggedMesh) -> dict[str, np.ndarray]:
         "feet": mesh.share(feet) > _MAJORITY,
         "torso": mesh.share(_TORSO) > _MAJORITY,
         "between_toes": _between_toes(mesh, normals),
-        "armpits": _armpits(mesh),
+        "armpits": _armpits(mesh, normals),
     }
     segments = {name: np.flatnonzero(mask | mask[mesh.mirror]) for name, mask in masks.items()}
     segments |= {"mouth_bag": np.sort(mouth), "eye_bags": np.sort(eyes)}

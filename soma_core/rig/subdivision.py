@@ -78,7 +78,8 @@ def split_polygons(indices: np.ndarray, counts: np.ndarray, vertices: np.ndarray
     """Split triangles and quads into triangles, quads along their shorter diagonal.
 
     Args:
-        indices, counts: polygon stream.
+        indices: flat vertex ids of the polygons.
+        counts: corners of each polygon, 3 or 4.
         vertices: (v, 3) positions that decide the diagonal; a tie takes corners 0 and 2.
 
     Returns:

@@ -8,15 +8,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-import scipy.sparse
 
 from soma_core.errors import AssetError
 from soma_core.rig.influences import read_weights
 from soma_core.rig.manifest import refuse_unreadable
 from soma_core.rig.mesh import Lod
-from soma_core.rig.revision import REVISION_DIGITS, rig_hash
 from soma_core.rig.skeleton import Rig
-from soma_core.rig.transforms import depth_order, project_rotations, world_transforms
+from soma_core.rig.stored import StoredRig
+from soma_core.rig.transforms import world_transforms
 
 if TYPE_CHECKING:
     from pxr import Usd, UsdSkel
@@ -26,12 +25,6 @@ __all__ = ["MESH_NAMES", "UsdRig", "read_usd_rig"]
 MESH_NAMES: dict[str, tuple[str, ...]] = {
     "mid": ("c_skin_mid", "c_bodyRig_mid", "c_skin"),
     "low": ("c_skin_lo", "c_bodyRig_lo", "c_skin_low", "c_bodyRig_low"),
-}
-
-# Z-up, facing -Y, to +Y up, facing +Z: (x, y, z) -> (x, z, -y).
-_UP_TO_Y = {
-    "Y": np.eye(4),
-    "Z": np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]]),
 }
 
 
@@ -235,43 +228,6 @@ def _fan_triangles(indices: np.ndarray, counts: np.ndarray) -> np.ndarray:
     return np.array(triangles, np.int32).reshape(-1, 3)
 
 
-def _scaled(transforms: np.ndarray, factor: float) -> np.ndarray:
-    """Scale the translations of (J, 4, 4) transforms."""
-    scaled = transforms.copy()
-    scaled[:, :3, 3] *= factor
-    return scaled
-
-
-def _metric_rig(
-    skeleton: _Skeleton,
-    points: np.ndarray,
-    weights: scipy.sparse.csr_array,
-    unit: float,
-    up: str,
-    revision: str,
-) -> Rig:
-    """Bring a stored rig to metres, +Y up, exact rotations, unit row sums and parent-first order."""
-    turn = _UP_TO_Y[up]
-    bind, t_pose = (
-        project_rotations(turn @ _scaled(world, unit) @ turn.T)
-        for world in (skeleton.bind_world, skeleton.t_pose_world)
-    )
-    order = depth_order(skeleton.parents)
-    if (skeleton.parents < np.arange(len(order))).all():
-        order = np.arange(len(order))
-    place = np.append(np.argsort(order), -1)
-    rows = scipy.sparse.diags_array(1.0 / weights.sum(axis=1))
-    return Rig(
-        joint_names=tuple(skeleton.joint_names[joint] for joint in order),
-        parents=place[skeleton.parents[order]].astype(np.int32),
-        bind_world=bind[order],
-        t_pose_world=t_pose[order],
-        bind_shape=unit * points @ turn[:3, :3].T,
-        weights=scipy.sparse.csr_array((rows @ weights)[:, order]),
-        revision=revision,
-    )
-
-
 def read_usd_rig(
     path: Path, *, mesh: str | None = None, lod: Lod = "mid", triangles: np.ndarray | None = None
 ) -> UsdRig:
@@ -294,7 +250,7 @@ def read_usd_rig(
 
     stage = _open(path)
     up = str(UsdGeom.GetStageUpAxis(stage))
-    if up not in _UP_TO_Y:
+    if up not in ("Y", "Z"):
         raise AssetError(path, cause=f"upAxis is {up}, expected Y or Z", fix="Export it again with +Y up")
     skin = _choose_mesh(path, stage, mesh, lod)
     skeleton = _read_skeleton(path, _skeleton_prim(path, stage, skin))
@@ -302,20 +258,20 @@ def read_usd_rig(
     weights = read_weights(path, skin, skeleton.joint_paths, len(points))
     indices, counts = _polygons(path, skin, len(points))
     uv, uv_indices = _texture(skin, len(indices))
-    unit = float(UsdGeom.GetStageMetersPerUnit(stage))
-    centimetres = unit / 0.01
-    digits = rig_hash(
+    stored = StoredRig(
         joint_names=skeleton.joint_names,
         parents=skeleton.parents,
-        bind_world=_scaled(skeleton.bind_world, centimetres),
-        t_pose_world=_scaled(skeleton.t_pose_world, centimetres),
-        bind_shape=centimetres * points,
+        bind_world=skeleton.bind_world,
+        t_pose_world=skeleton.t_pose_world,
+        bind_shape=points,
         weights=weights,
-        triangles=_fan_triangles(indices, counts) if triangles is None else triangles,
+        unit=float(UsdGeom.GetStageMetersPerUnit(stage)),
+        up=up,
     )
+    digest = stored.digest(_fan_triangles(indices, counts) if triangles is None else triangles)
     return UsdRig(
-        rig=_metric_rig(skeleton, points, weights, unit, up, digits[:REVISION_DIGITS]),
-        rig_hash=digits,
+        rig=stored.metric(digest),
+        rig_hash=digest,
         face_vert_indices=indices,
         face_vert_counts=counts,
         uv=uv,

