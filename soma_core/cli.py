@@ -143,8 +143,8 @@ def _assets(arguments: Sequence[str]) -> int:
         assets.build_assets(options.output, options.shape_space)
         _say(str(options.output))
     else:
-        assets.verify_assets(options.root)
-        _say(f"{options.root}: every file is what MANIFEST.json says")
+        checked = assets.verify_assets(options.root)
+        _say(f"{options.root}: {len(checked)} files are what MANIFEST.json says")
     return EXIT_OK
 
 
