@@ -1,0 +1,109 @@
+"""The `soma` backend: the native PCA shape space on the canonical mesh (paper, section 3.2).
+
+It is found, declared and built through the same hooks as every other backend.
+"""
+
+from __future__ import annotations
+
+import zipfile
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from soma_core.errors import AssetError
+from soma_core.paths import assets_dir
+from soma_core.plugin.hookspecs import hookimpl
+from soma_core.plugin.spec import BackendSpec, Generator, LinearBasis, Parameter
+
+if TYPE_CHECKING:
+    import torch
+    from torch import Tensor
+
+__all__ = ["NativeGenerator", "component_count", "soma_backend", "soma_generator"]
+
+_FILE = "SOMA_neutral.npz"
+
+
+def component_count(path: Path) -> int:
+    """Read the number of components from the header of one array; the arrays themselves stay unread.
+
+    Raises:
+        AssetError: the file is missing, damaged, or holds no shape space.
+    """
+    try:
+        with zipfile.ZipFile(path) as archive, archive.open("eigenvalues.npy") as stream:
+            major, _ = np.lib.format.read_magic(stream)
+            read_header = {1: np.lib.format.read_array_header_1_0, 2: np.lib.format.read_array_header_2_0}
+            shape, _, _ = read_header[major](stream)
+            (count,) = shape
+    except (OSError, KeyError, ValueError, zipfile.BadZipFile) as error:
+        raise AssetError(
+            path,
+            cause=f"no shape space can be read ({type(error).__name__}: {error})",
+            fix="Restore it with `git checkout -- assets`, or make it again with `soma assets build`",
+        ) from error
+    return int(count)
+
+
+@hookimpl
+def soma_backend() -> BackendSpec:
+    """Declare the native shape space: centimetres, +Y up, +Z forward, already on the canonical mesh."""
+    count = component_count(assets_dir() / _FILE)
+    return BackendSpec(
+        name="soma",
+        unit="cm",
+        up="+y",
+        forward="+z",
+        wrap=None,
+        params=(
+            Parameter(
+                name="shape",
+                shape=(count,),
+                description="coefficients in standard deviations; a shorter list is padded with zeros",
+            ),
+        ),
+        licence="Apache-2.0",
+        description=f"the native shape space, {count} components",
+    )
+
+
+@hookimpl
+def soma_generator(device: torch.device, dtype: torch.dtype) -> Generator:
+    """Build the generator from the shipped shape space; it has no options and needs no declaration."""
+    from soma_core.rig.neutral import load_shape_space
+
+    space = load_shape_space()
+    scaled = np.sqrt(space.eigenvalues.astype(np.float64))[:, None] * space.shapedirs
+    return NativeGenerator(space.mean, scaled.reshape(-1, *space.mean.shape), device=device, dtype=dtype)
+
+
+class NativeGenerator:
+    """A linear shape space: ``mean + shape @ directions``, in centimetres.
+
+    Args:
+        mean: (v, 3) [cm].
+        directions: (k, v, 3) [cm], one standard deviation each; k may be 0.
+        device: where the tensors live.
+        dtype: floating type of the tensors.
+    """
+
+    def __init__(
+        self, mean: np.ndarray, directions: np.ndarray, *, device: torch.device, dtype: torch.dtype
+    ) -> None:
+        import torch
+
+        self._mean = torch.from_numpy(np.array(mean)).to(device=device, dtype=dtype)
+        self._directions = torch.from_numpy(directions).to(device=device, dtype=dtype)
+
+    def rest(self, params: Mapping[str, Tensor]) -> Tensor:
+        """Rest vertices (batch, v, 3) [cm] for ``shape`` (batch, k); differentiable."""
+        motion = params["shape"] @ self._directions.flatten(1)
+        return self._mean + motion.unflatten(-1, self._mean.shape)
+
+    def linear_basis(self) -> LinearBasis:
+        """The mean, the directions, and ``shape`` as coefficients."""
+        return LinearBasis(
+            template=self._mean, basis=self._directions, coefficients=lambda params: params["shape"]
+        )
