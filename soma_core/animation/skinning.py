@@ -6,9 +6,8 @@ import numpy as np
 import scipy.sparse
 import torch
 from torch import Tensor
-from torch.nn.functional import embedding_bag
 
-from soma_core.geometry.sparse import SparseRows
+from soma_core.geometry.sparse import SparseRows, gather_rows
 
 __all__ = ["Skinning", "skinning_transforms"]
 
@@ -33,14 +32,22 @@ class Skinning(torch.nn.Module):
     def __init__(self, weights: scipy.sparse.csr_array, *, dtype: torch.dtype, device: torch.device | str) -> None:
         super().__init__()
         self.weights = SparseRows(weights, dtype=dtype, device=device)
-        expanded = 4 * weights.indices.astype(np.int64)[:, None] + np.arange(4)
+        weights = weights.sorted_indices()
+        vertices, joints = weights.shape
+        columns = (4 * weights.indices.astype(np.int64)[:, None] + np.arange(4)).ravel()
+        starts = 4 * weights.indptr.astype(np.int64)
+        order = scipy.sparse.csr_array((np.arange(len(columns)), columns, starts), shape=(vertices, 4 * joints))
+        turned = order.T.tocsr()
 
         def keep(name: str, array: np.ndarray) -> None:
-            self.register_buffer(name, torch.as_tensor(array, device=device), persistent=False)
+            self.register_buffer(name, torch.as_tensor(array, dtype=torch.int64, device=device), persistent=False)
 
-        keep("point_col", expanded.ravel())
-        keep("point_crow", 4 * weights.indptr.astype(np.int64))
-        keep("influence_vertex", np.repeat(np.arange(weights.shape[0]), np.diff(weights.indptr)))
+        keep("point_col", columns)
+        keep("point_crow", starts)
+        keep("point_t_col", turned.indices)
+        keep("point_t_crow", turned.indptr)
+        keep("point_t_order", turned.data)
+        keep("influence_vertex", np.repeat(np.arange(vertices), np.diff(weights.indptr)))
 
     def forward(self, vertices: Tensor, transforms: Tensor) -> Tensor:
         """Skinned vertices (v, 3, B).
@@ -76,7 +83,7 @@ class Skinning(torch.nn.Module):
         values = (self.weights.val[:, None] * point[self.influence_vertex]).ravel()
         batch, joints = transforms.shape[:2]
         dense = transforms.permute(1, 3, 2, 0).reshape(4 * joints, 3 * batch)
-        out = embedding_bag(
-            self.point_col, dense, self.point_crow, mode="sum", per_sample_weights=values, include_last_offset=True
-        )
+        pattern = (self.point_crow, self.point_col, values)
+        turned = values[self.point_t_order] if dense.requires_grad else values
+        out = gather_rows(dense, pattern, (self.point_t_crow, self.point_t_col, turned))
         return out.view(-1, 3, batch)

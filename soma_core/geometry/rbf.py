@@ -38,5 +38,5 @@ def affine_rbf_weights(points: np.ndarray, queries: np.ndarray) -> np.ndarray:
     if flat:
         solution = scipy.linalg.lstsq(system, right, cond=1e-12)[0]
     else:
-        solution = scipy.linalg.solve(system, right, assume_a="sym")
+        solution = scipy.linalg.solve(system, right, assume_a="gen", overwrite_a=True, check_finite=False)
     return solution[:count].T

@@ -8,7 +8,11 @@ import torch
 from torch import Tensor
 from torch.nn.functional import embedding_bag
 
-__all__ = ["SparseRows"]
+__all__ = ["SparseRows", "gather_rows"]
+
+Csr = tuple[Tensor, Tensor, Tensor]
+"""Row starts (m + 1,), column ids (e,), values (e,)."""
+
 
 
 class _Gather(torch.autograd.Function):
@@ -31,6 +35,14 @@ class _Gather(torch.autograd.Function):
         return back, None, None, None, None, None, None
 
 
+def gather_rows(dense: Tensor, matrix: Csr, transpose: Csr) -> Tensor:
+    """Product of a sparse (m, n) matrix, given with its transpose, and a dense (n, f) one; (m, f).
+
+    Differentiable in `dense` only; the transpose is read in the backward pass alone.
+    """
+    return _Gather.apply(dense, *matrix, *transpose)
+
+
 class SparseRows(torch.nn.Module):
     """A constant sparse matrix (m, n) in CSR form, with its transpose for the backward pass.
 
@@ -43,7 +55,7 @@ class SparseRows(torch.nn.Module):
         forward, backward = matrix.tocsr(), matrix.T.tocsr()
         self.shape = tuple(forward.shape)
         for prefix, csr in (("", forward), ("t_", backward)):
-            csr.sort_indices()
+            csr = csr.sorted_indices()
             self._keep(prefix + "crow", csr.indptr, torch.int64, device)
             self._keep(prefix + "col", csr.indices, torch.int64, device)
             self._keep(prefix + "val", csr.data, dtype, device)
@@ -53,4 +65,4 @@ class SparseRows(torch.nn.Module):
 
     def forward(self, dense: Tensor) -> Tensor:
         """Product with (n, f); (m, f)."""
-        return _Gather.apply(dense, self.crow, self.col, self.val, self.t_crow, self.t_col, self.t_val)
+        return gather_rows(dense, (self.crow, self.col, self.val), (self.t_crow, self.t_col, self.t_val))

@@ -1,1 +1,1 @@
-"""TBD."""
+"""Warp twins of the hot functions: same names and signatures as the torch reference."""

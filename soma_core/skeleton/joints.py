@@ -14,7 +14,7 @@ from soma_core.rig.skeleton import Rig
 
 __all__ = ["joint_neighbourhoods", "joint_regressor"]
 
-_CODE_VERSION = "1"
+_CODE_VERSION = "2"
 
 
 def joint_neighbourhoods(mesh: CanonicalMesh, rig: Rig) -> list[np.ndarray]:

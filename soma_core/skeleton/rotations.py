@@ -24,16 +24,12 @@ class AlignmentPlan:
 
     Attributes:
         pivots: joints with children, Root excluded, (p,).
-        only_child: for each pivot the id of its single child, or -1, (p,).
-        child_start: offsets into `children`, (p + 1,).
-        children: children of the pivots, bones too short left out, concatenated.
+        child_table: (p, width) ids of each pivot's children, bones too short left out, padded with -1.
         source: for each joint the position in `pivots` whose displacement it takes; -1 is identity.
     """
 
     pivots: np.ndarray
-    only_child: np.ndarray
-    child_start: np.ndarray
-    children: np.ndarray
+    child_table: np.ndarray
     source: np.ndarray
 
 
@@ -52,63 +48,71 @@ def alignment_plan(rig: Rig) -> AlignmentPlan:
     source = np.full(rig.joint_count, -1)
     for joint in range(1, rig.joint_count):
         source[joint] = rank.get(joint, source[rig.parents[joint]])
-    counts = [len(children[joint]) for joint in pivots]
-    return AlignmentPlan(
-        pivots=np.array(pivots, np.int64),
-        only_child=np.array([children[j][0] if len(children[j]) == 1 else -1 for j in pivots], np.int64),
-        child_start=np.concatenate([[0], np.cumsum(counts)]).astype(np.int64),
-        children=np.array([c for j in pivots for c in children[j]], np.int64),
-        source=source,
-    )
+    width = max([2, *(len(children[joint]) for joint in pivots)])
+    table = np.full((len(pivots), width), -1)
+    for row, joint in enumerate(pivots):
+        table[row, : len(children[joint])] = children[joint]
+    return AlignmentPlan(pivots=np.array(pivots, np.int64), child_table=table, source=source)
 
 
 class RotationFit(torch.nn.Module):
-    """Stage 2 for all joints at once, on constant index lists; see :func:`fit_rotations`."""
+    """Stage 2 for all joints at once, on constant index lists; see :func:`fit_rotations`.
 
-    def __init__(self, rig: Rig, *, dtype: torch.dtype, device: torch.device | str) -> None:
+    Args:
+        rig: joints and bind pose.
+        warp: run the Warp twin instead of the torch reference.
+    """
+
+    def __init__(self, rig: Rig, *, dtype: torch.dtype, device: torch.device | str, warp: bool = False) -> None:
         super().__init__()
-        self.plan = plan = alignment_plan(rig)
-        bind = rig.bind_world[:, :3, 3]
-        single = np.flatnonzero(plan.only_child >= 0)
-        several = np.flatnonzero(plan.only_child < 0)
-        owner = np.repeat(np.arange(len(plan.pivots)), np.diff(plan.child_start))
-        fan = np.isin(owner, several)
-        slot = np.searchsorted(several, owner[fan])
+        self.warp = warp
+        plan = alignment_plan(rig)
+        table, bind = plan.child_table, rig.bind_world[:, :3, 3]
+        single, several = np.flatnonzero(table[:, 1] < 0), np.flatnonzero(table[:, 1] >= 0)
+        slot, column = np.nonzero(table[several] >= 0)
 
         def keep(name: str, array: np.ndarray) -> None:
-            tensor = torch.as_tensor(np.ascontiguousarray(array), device=device)
+            tensor = torch.as_tensor(np.array(array), device=device)
             self.register_buffer(name, tensor.to(dtype) if tensor.is_floating_point() else tensor, persistent=False)
 
         keep("pivots", plan.pivots)
+        keep("child_table", table)
         keep("single", single)
-        keep("single_parent", plan.pivots[single])
-        keep("single_child", plan.only_child[single])
-        keep("single_bone", bind[plan.only_child[single]] - bind[plan.pivots[single]])
+        keep("single_child", table[single, 0])
         keep("several", several)
         keep("fan_slot", slot)
-        keep("fan_owner", owner[fan])
-        keep("fan_parent", plan.pivots[owner[fan]])
-        keep("fan_child", plan.children[fan])
-        keep("fan_bone", bind[plan.children[fan]] - bind[plan.pivots[owner[fan]]])
+        keep("fan_child", table[several[slot], column])
         keep("order", np.argsort(np.concatenate([single, several])))
         keep("source", plan.source + 1)
+        keep("bind", bind)
         keep("bind_rotation", rig.bind_world[:, :3, :3])
 
     def forward(self, joints: Tensor, covariances: Tensor) -> Tensor:
         """World rotations (B, J, 3, 3) from joint positions (B, J, 3) and covariances (B, J, 3, 3)."""
-        initial = rotation_from_covariance(covariances[:, self.pivots])
-        first = initial[:, self.single]
-        turned = (first @ self.single_bone[:, :, None]).squeeze(-1)
-        target = joints[:, self.single_child] - joints[:, self.single_parent]
-        aligned = shortest_arc(turned, target) @ first
-        fan = (initial[:, self.fan_owner] @ self.fan_bone[:, :, None]).squeeze(-1)
-        reach = joints[:, self.fan_child] - joints[:, self.fan_parent]
-        outer = reach[..., :, None] * fan[..., None, :]
-        sums = outer.new_zeros(len(joints), len(self.several), 3, 3).index_add(1, self.fan_slot, outer)
-        spread = rotation_from_covariance(sums) @ initial[:, self.several]
-        displacement = torch.cat((aligned, spread), 1)[:, self.order]
+        if self.warp:
+            from soma_core.kernels.skeleton_fit_wp import fit_displacements
+
+            displacement = fit_displacements(joints, covariances, self.bind, self.pivots, self.child_table)
+        else:
+            displacement = self._displacements(joints, covariances)
         eye = torch.eye(3, dtype=joints.dtype, device=joints.device).expand(len(joints), 1, 3, 3)
         return torch.cat((eye, displacement), 1)[:, self.source] @ self.bind_rotation
+
+    def _displacements(self, joints: Tensor, covariances: Tensor) -> Tensor:
+        initial = rotation_from_covariance(covariances[:, self.pivots])
+        first, target = self._bones(joints, initial, self.single, self.single_child)
+        aligned = shortest_arc(first, target) @ initial[:, self.single]
+        first, target = self._bones(joints, initial, self.several[self.fan_slot], self.fan_child)
+        outer = target[..., :, None] * first[..., None, :]
+        sums = outer.new_zeros(len(joints), len(self.several), 3, 3).index_add(1, self.fan_slot, outer)
+        spread = rotation_from_covariance(sums) @ initial[:, self.several]
+        return torch.cat((aligned, spread), 1)[:, self.order]
+
+    def _bones(self, joints: Tensor, initial: Tensor, rank: Tensor, child: Tensor) -> tuple[Tensor, Tensor]:
+        """Bind bones turned by stage a, and fitted bones, from the pivots at `rank` to `child`."""
+        parent = self.pivots[rank]
+        bone = (self.bind[child] - self.bind[parent])[..., None]
+        return (initial[:, rank] @ bone).squeeze(-1), joints[:, child] - joints[:, parent]
 
 
 def fit_rotations(rig: Rig, joints: Tensor, covariances: Tensor) -> Tensor:

@@ -1,1 +1,1 @@
-"""TBD."""
+"""Mesh topology abstraction (paper, section 3.3): native vertices brought to the canonical mesh."""

@@ -1,0 +1,109 @@
+"""Checks of pose inputs at the public boundary."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from soma_core.errors import InputError
+from soma_core.geometry.rotations import axis_angle_to_matrix, orthonormality_error
+
+__all__ = ["check_rotations", "check_translation"]
+
+_ROTATION_TOLERANCE = 1e-2
+"""Largest accepted entry of |R^T R - I|: above it a matrix is a mistake, not rounding."""
+
+
+def _check_kind(name: str, value: object, dtype: torch.dtype, device: torch.device) -> None:
+    if not isinstance(value, Tensor):
+        raise InputError(
+            name, got=type(value).__name__, expected="a torch.Tensor", fix=f"Wrap it: torch.as_tensor({name})."
+        )
+    if value.dtype != dtype:
+        raise InputError(
+            name, got=value.dtype, expected=dtype, fix=f"Call {name}.to({dtype}) or build the layer with its dtype."
+        )
+    if value.device.type != device.type or (device.index is not None and value.device != device):
+        raise InputError(name, got=value.device, expected=device, fix=f"Call {name}.to({str(device)!r}).")
+
+
+def _may_look(value: Tensor) -> bool:
+    """Whether values can be read without waiting for a device or breaking a graph."""
+    return not torch.compiler.is_compiling() and value.device.type == "cpu"
+
+
+def _check_finite(name: str, value: Tensor) -> None:
+    if not _may_look(value) or torch.isfinite(value.detach().sum()):
+        return
+    finite = torch.isfinite(value.detach())
+    if finite.all():  # the sum overflowed, the entries are fine
+        return
+    where = tuple(int(i) for i in torch.nonzero(~finite)[0])
+    raise InputError(
+        name,
+        got=f"{float(value.detach()[where])} at index {where}",
+        expected="finite numbers",
+        fix="Look at where this array was computed.",
+    )
+
+
+def check_rotations(
+    rotations: Tensor, joint_count: int, dtype: torch.dtype, device: torch.device, *, validate: bool
+) -> Tensor:
+    """Matrices (batch, joints, 3, 3) from axis-angle or matrices, or a clear refusal."""
+    _check_kind("rotations", rotations, dtype, device)
+    shape = tuple(rotations.shape)
+    axis_angle = rotations.ndim == 3 and shape[1:] == (joint_count, 3)
+    if not axis_angle and not (rotations.ndim == 4 and shape[1:] == (joint_count, 3, 3)):
+        raise InputError(
+            "rotations",
+            got=shape,
+            expected=f"(batch, {joint_count}, 3) axis-angle or (batch, {joint_count}, 3, 3) matrices",
+            fix=_shape_hint(shape, joint_count),
+        )
+    _check_finite("rotations", rotations)
+    if axis_angle:
+        return axis_angle_to_matrix(rotations)
+    if validate and _may_look(rotations):
+        _check_orthonormal(rotations.detach())
+    return rotations
+
+
+def _shape_hint(shape: tuple[int, ...], joint_count: int) -> str:
+    if shape in ((joint_count, 3), (joint_count, 3, 3)):
+        return "Add the batch axis: rotations[None]."
+    if len(shape) > 1 and shape[1] == joint_count + 1:
+        return "Leave out the virtual Root: rotations[:, 1:]."
+    return "Order the joints as in layer.joint_names."
+
+
+def _check_orthonormal(rotations: Tensor) -> None:
+    error = orthonormality_error(rotations)
+    worst = int(error.argmax())
+    if float(error.flatten()[worst]) > _ROTATION_TOLERANCE:
+        frame, joint = divmod(worst, rotations.shape[1])
+        raise InputError(
+            f"rotations[{frame}, {joint}]",
+            got=f"a matrix {float(error.flatten()[worst]):.3g} away from a rotation",
+            expected=f"R^T R = I and det R = 1 within {_ROTATION_TOLERANCE:g}",
+            fix="Orthonormalise it, drop the scale, or pass axis-angle.",
+        )
+
+
+def check_translation(
+    translation: Tensor | None, batch: int, dtype: torch.dtype, device: torch.device, *, validate: bool
+) -> Tensor:
+    """Hips positions (batch, 3) [m]; zeros when None."""
+    if translation is None:
+        return torch.zeros(batch, 3, dtype=dtype, device=device)
+    _check_kind("translation", translation, dtype, device)
+    if tuple(translation.shape) not in ((3,), (1, 3), (batch, 3)):
+        raise InputError(
+            "translation",
+            got=tuple(translation.shape),
+            expected=f"({batch}, 3), (1, 3) or (3,)",
+            fix="Give one Hips position [m] a pose.",
+        )
+    if validate:
+        _check_finite("translation", translation)
+    return translation.expand(batch, 3)

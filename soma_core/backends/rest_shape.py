@@ -1,0 +1,106 @@
+"""From parameters to a canonical rest shape and its fitted skeleton: exact or composed (paper, 3.2 to 3.4)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from soma_core.backends.parameters import batch_parameters
+from soma_core.plugin.spec import BackendSpec, Generator, HasLinearBasis, LinearBasis
+from soma_core.rig.mesh import CanonicalMesh
+from soma_core.rig.skeleton import Rig
+from soma_core.skeleton.fit import SkeletonFit
+from soma_core.topology.compose import compose
+from soma_core.topology.correspondence import load_correspondence
+from soma_core.topology.transfer import CanonicalPassThrough, TopologyTransfer, make_transfer
+
+__all__ = ["ComposedRestShape", "ExactRestShape", "make_rest_shape"]
+
+
+class ExactRestShape(torch.nn.Module):
+    """Generator, transfer and skeleton fit one after the other, on every vertex."""
+
+    def __init__(
+        self, generator: Generator, transfer: TopologyTransfer | CanonicalPassThrough, fit: SkeletonFit
+    ) -> None:
+        super().__init__()
+        self.generator, self.transfer, self.fit = generator, transfer, fit
+
+    def forward(self, params: Mapping[str, Tensor]) -> tuple[Tensor, Tensor]:
+        """Vertices (v, 3, B) [m] and fitted transforms (B, J, 4, 4) [m]."""
+        vertices = self.transfer(self.generator.rest(params))
+        return vertices.permute(1, 2, 0), self.fit(vertices)
+
+
+class ComposedRestShape(torch.nn.Module):
+    """A linear backend as one matrix: vertices and skeleton moments from coefficients in one product.
+
+    Joint positions and covariances are linear in the vertices and so in the coefficients; their rows are
+    stacked under those of the vertices.
+    """
+
+    def __init__(
+        self, linear: LinearBasis, transfer: TopologyTransfer | CanonicalPassThrough, fit: SkeletonFit, at: Tensor
+    ) -> None:
+        super().__init__()
+        self.coefficients, self.fit = linear.coefficients, fit
+        composed = compose(linear, transfer, at)
+        self.vertex_count = len(composed.template) // 3
+        matrix = fit.matrix
+        moments = _apply_rows(matrix, composed.template[:, None])
+        self.register_buffer("template", torch.cat((composed.template[:, None], moments)), persistent=False)
+        basis = torch.cat((composed.basis, _apply_rows(matrix, composed.basis)))
+        self.register_buffer("basis", basis, persistent=False)
+        self.exact = composed.exact
+        if self.exact is not None:
+            columns = matrix.tocsc()[:, self.exact.rows.cpu().numpy()].toarray()
+            tensor = torch.as_tensor(columns, dtype=basis.dtype, device=basis.device)
+            self.register_buffer("offset_moments", tensor, persistent=False)
+
+    def forward(self, params: Mapping[str, Tensor]) -> tuple[Tensor, Tensor]:
+        """Vertices (v, 3, B) [m] and fitted transforms (B, J, 4, 4) [m]."""
+        coefficients = self.coefficients(params)
+        stacked = torch.addmm(self.template, self.basis, coefficients.T)
+        batch, size = len(coefficients), 3 * self.vertex_count
+        vertices, moments = stacked[:size].view(-1, 3, batch), stacked[size:].view(-1, 3, batch)
+        if self.exact is not None:
+            offsets = self.exact.evaluate(coefficients)
+            vertices = vertices.index_add(0, self.exact.rows, offsets)
+            moments = moments + (self.offset_moments @ offsets.flatten(1)).view(-1, 3, batch)
+        moments = moments.view(self.fit.joint_count, 4, 3, batch).permute(3, 0, 1, 2)
+        return vertices, self.fit.from_moments(moments)
+
+
+def _apply_rows(matrix, flat: Tensor) -> Tensor:
+    """(m, v) sparse times (v * 3, k) vertex-major columns -> (m * 3, k), in float64."""
+    count, columns = flat.shape[0] // 3, flat.shape[1]
+    parts = []
+    for start in range(0, columns, 32):
+        block = flat[:, start : start + 32].double().cpu().numpy().reshape(count, -1)
+        parts.append((matrix @ block).reshape(matrix.shape[0] * 3, -1))
+    return torch.as_tensor(np.hstack(parts), dtype=flat.dtype, device=flat.device)
+
+
+def make_rest_shape(
+    spec: BackendSpec,
+    generator: Generator,
+    mesh: CanonicalMesh,
+    rig: Rig,
+    *,
+    dtype: torch.dtype,
+    device: torch.device,
+    exact: bool,
+) -> ExactRestShape | ComposedRestShape:
+    """The rest-shape module of a backend: composed when it is linear, unless `exact` asks otherwise."""
+    fit = SkeletonFit(mesh, rig, dtype=dtype, device=device)
+    correspondence = None if spec.wrap is None else load_correspondence(spec.wrap, mesh)
+    transfer = make_transfer(spec, mesh, correspondence, dtype=dtype, device=device)
+    if exact or not isinstance(generator, HasLinearBasis):
+        return ExactRestShape(generator, transfer, fit)
+    linear = generator.linear_basis()
+    with torch.no_grad():
+        at = linear.coefficients(batch_parameters(spec, {}, device=device, dtype=dtype))[0]
+    return ComposedRestShape(linear, transfer, fit, at)

@@ -1,0 +1,56 @@
+"""One place that starts Warp quietly, names scalar types, and hands torch memory and streams to it."""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import logging
+from collections.abc import Iterator
+from typing import Any
+
+import torch
+import warp as wp
+
+from soma_core.errors import InputError
+
+__all__ = ["as_warp", "launching", "scalar_name", "start"]
+
+_log = logging.getLogger(__name__)
+
+_SCALARS = {torch.float32: wp.float32, torch.float64: wp.float64}
+
+
+@functools.cache
+def start() -> None:
+    """Initialise Warp once, without its banner or its notice that no GPU is present."""
+    wp.config.quiet = True
+    if hasattr(wp, "LOG_ERROR"):
+        wp.config.log_level = wp.LOG_ERROR
+    wp.init()
+    _log.debug("Warp %s ready", wp.config.version)
+
+
+def scalar_name(dtype: torch.dtype) -> str:
+    """``float32`` or ``float64``: the key of a kernel family."""
+    if dtype not in _SCALARS:
+        raise InputError(
+            "dtype", got=dtype, expected="torch.float32 or torch.float64", fix="Convert, or use kernels='torch'."
+        )
+    return str(dtype).removeprefix("torch.")
+
+
+def as_warp(tensor: torch.Tensor, dtype: Any = None) -> wp.array:
+    """A Warp view of a tensor's memory; no copy when it is contiguous, no gradient."""
+    return wp.from_torch(tensor.detach().contiguous(), dtype=dtype, requires_grad=False)
+
+
+@contextlib.contextmanager
+def launching(tensor: torch.Tensor) -> Iterator[Any]:
+    """The device to launch on; on CUDA, within torch's current stream, so that both see one order of work."""
+    start()
+    device = wp.device_from_torch(tensor.device)
+    if not tensor.is_cuda:
+        yield device
+        return
+    with wp.ScopedStream(wp.stream_from_torch(torch.cuda.current_stream(tensor.device))):
+        yield device

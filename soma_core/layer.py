@@ -1,0 +1,184 @@
+"""SomaLayer: the whole forward path of the paper (section 3) as one module without hidden state."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, Literal
+
+import torch
+from torch import Tensor
+
+from soma_core._inputs import check_rotations, check_translation
+from soma_core.animation.engine import Animation
+from soma_core.animation.posed import Posed
+from soma_core.backends.parameters import batch_parameters
+from soma_core.backends.rest_shape import make_rest_shape
+from soma_core.errors import InputError
+from soma_core.plugin.registry import Registry, default_registry
+from soma_core.rig import load_canonical
+from soma_core.rig.mesh import CanonicalMesh, Lod
+from soma_core.rig.skeleton import Rig
+from soma_core.skeleton.identity import Identity
+
+__all__ = ["Kernels", "SomaLayer"]
+
+Kernels = Literal["auto", "torch", "warp"]
+
+
+class SomaLayer(torch.nn.Module):
+    """Any identity backend, animated on the canonical rig.
+
+    ``identity`` and ``pose`` are functions of their arguments: the layer keeps no identity and no cache,
+    so threads, batches and ``torch.compile`` cannot trip over each other.
+
+    Args:
+        backend: name of an installed backend; ``soma backends`` lists them.
+        options: the backend's own options.
+        lod: level of detail of every mesh that comes out.
+        device, dtype: of all constants and results; float32 or float64.
+        kernels: ``torch`` (the reference), ``warp`` or ``auto``, whichever the benchmark found faster.
+        exact: evaluate the generator and the transfer vertex by vertex even where the backend is linear
+            and could be composed; slower, the reference for tests.
+        repose: bring every identity to the rig's bind pose (correctives and twist vanish there).
+        validate: check that matrices are rotations. Finiteness is checked on CPU only, since on CUDA
+            that would wait for the device.
+        canonical: another mesh and rig than the shipped ones.
+        registry: where backends are looked up.
+
+    Raises:
+        InputError: an unknown dtype, LOD or kernel choice.
+        BackendError: the backend is not installed or does not build.
+    """
+
+    def __init__(
+        self,
+        backend: str = "soma",
+        *,
+        options: Mapping[str, Any] | None = None,
+        lod: Lod = "mid",
+        device: torch.device | str = "cpu",
+        dtype: torch.dtype = torch.float32,
+        kernels: Kernels = "auto",
+        exact: bool = False,
+        repose: bool = True,
+        validate: bool = True,
+        canonical: tuple[CanonicalMesh, Rig] | None = None,
+        registry: Registry | None = None,
+    ) -> None:
+        super().__init__()
+        _check_choice("lod", lod, ("mid", "low"))
+        _check_choice("kernels", kernels, ("auto", "torch", "warp"))
+        _check_choice("dtype", dtype, (torch.float32, torch.float64))
+        self.backend = backend
+        self.options = dict(options or {})
+        self.kernels = kernels
+        self.exact, self.repose, self.validate = exact, repose, validate
+        self.mesh, self.rig = canonical or load_canonical(lod)
+        self._registry = registry or default_registry()
+        self.spec = self._registry.spec(backend)
+        self._build(torch.device(device), dtype)
+
+    def _build(self, device: torch.device, dtype: torch.dtype) -> None:
+        self.device, self.dtype = device, dtype
+        generator = self._registry.generator(self.backend, device=device, dtype=dtype, options=self.options)
+        self.rest_shape = make_rest_shape(
+            self.spec, generator, self.mesh, self.rig, device=device, dtype=dtype, exact=self.exact
+        )
+        self.animation = Animation(self.rig, device=device, dtype=dtype, kernels=self.kernels)
+
+    def _apply(self, fn, recurse=True):
+        """Rebuild for the new device or dtype: constants are derived in float64, never cast twice."""
+        probe = fn(torch.empty(0, dtype=self.dtype, device=self.device))
+        if (probe.device, probe.dtype) != (self.device, self.dtype):
+            _check_choice("dtype", probe.dtype, (torch.float32, torch.float64))
+            self._build(probe.device, probe.dtype)
+        return self
+
+    @property
+    def joint_names(self) -> tuple[str, ...]:
+        """Names of the user joints, in the order of `rotations`."""
+        return self.rig.user_joint_names
+
+    def identity(self, params: Mapping[str, Any] | None = None) -> Identity:
+        """Prepare identities: rest shape on the canonical mesh and the skeleton fitted to it.
+
+        Args:
+            params: name -> number, list, array or tensor of shape (batch, *shape) or one sample; what is
+                left out takes its default. ``soma backends show`` lists names and ranges.
+
+        Returns:
+            An immutable identity [m]; paper, sections 3.2 to 3.4. Differentiable in every parameter.
+        """
+        batch = batch_parameters(self.spec, params, device=self.device, dtype=self.dtype)
+        vertices, fitted = self.rest_shape(batch)
+        rest, bind = self.animation.repose(vertices, fitted) if self.repose else (vertices, fitted)
+        return Identity(
+            rest=rest.permute(2, 0, 1),
+            bind_world=bind,
+            fitted_rest=vertices.permute(2, 0, 1),
+            fitted_world=fitted,
+            backend=self.backend,
+            rig_revision=self.rig.revision,
+            params=batch,
+        )
+
+    def pose(
+        self,
+        identity: Identity,
+        rotations: Tensor,
+        translation: Tensor | None = None,
+        *,
+        absolute: bool = False,
+    ) -> Posed:
+        """Pose identities (paper, section 3.5.1).
+
+        Args:
+            identity: batch of 1, shared by all poses, or of the same size as `rotations`.
+            rotations: axis-angle [rad] (batch, J - 1, 3) or matrices (batch, J - 1, 3, 3). Zero is the
+                T-pose: rotations are relative to it, in world-aligned axes. A batch of 1 is shared by all
+                identities.
+            translation: world position of the Hips [m], (batch, 3) or (3,); default the origin.
+            absolute: `rotations` are local rotations of the rig's own axes instead.
+
+        Raises:
+            InputError: a wrong shape, dtype or device, a NaN, a matrix that is no rotation.
+        """
+        relative = check_rotations(rotations, len(self.joint_names), self.dtype, self.device, validate=self.validate)
+        batch = _common_batch(identity.batch_size, len(relative))
+        shift = check_translation(translation, batch, self.dtype, self.device, validate=self.validate)
+        relative = relative.expand(batch, *relative.shape[1:])
+        return self.animation.pose(identity, relative, shift, absolute=absolute)
+
+    def forward(
+        self,
+        params: Mapping[str, Any] | None,
+        rotations: Tensor,
+        translation: Tensor | None = None,
+        *,
+        absolute: bool = False,
+    ) -> Posed:
+        """``pose(identity(params), rotations, translation)``."""
+        return self.pose(self.identity(params), rotations, translation, absolute=absolute)
+
+
+def _common_batch(identities: int, poses: int) -> int:
+    if identities == poses or poses == 1:
+        return identities
+    if identities == 1:
+        return poses
+    raise InputError(
+        "rotations",
+        got=f"a batch of {poses} for {identities} identities",
+        expected=f"a batch of {identities} or 1",
+        fix="Give one pose an identity, one pose for all, or one identity for all poses.",
+    )
+
+
+def _check_choice(argument: str, value: object, choices: tuple[object, ...]) -> None:
+    if value not in choices:
+        raise InputError(
+            argument,
+            got=repr(value),
+            expected="one of " + ", ".join(map(repr, choices)),
+            fix=f"Pass {argument}={choices[0]!r}.",
+        )

@@ -1,0 +1,52 @@
+"""Exact closest-face queries on a triangle mesh: a Warp BVH proposes, float64 decides."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from soma_core.geometry.barycentric import closest_point_on_triangle
+from soma_core.kernels.closest_point_wp import closest_faces
+
+__all__ = ["ClosestFaces"]
+
+
+class ClosestFaces:
+    """A mesh prepared for queries.
+
+    The BVH works in float32 and returns any one of the faces that share the closest point. All faces
+    touching that face are then measured in float64, and the lowest id among the nearest wins: the
+    answer is deterministic and does not depend on the tree.
+    """
+
+    def __init__(self, vertices: np.ndarray, triangles: np.ndarray) -> None:
+        self._vertices, self._triangles = vertices, triangles
+        order = np.argsort(triangles.ravel(), kind="stable")
+        self._face_of_corner = order // 3
+        self._start = np.searchsorted(triangles.ravel()[order], np.arange(len(vertices) + 1))
+
+    def query(self, points: np.ndarray) -> np.ndarray:
+        """Id of the closest face of each point; (m, 3) -> (m,) int64."""
+        centre = self._vertices.mean(0)
+        scale = float(np.abs(self._vertices - centre).max()) or 1.0
+        proposed = closest_faces(
+            (points - centre) / scale, (self._vertices - centre) / scale, self._triangles
+        )
+        query, face = self._touching(proposed)
+        closest = closest_point_on_triangle(points[query], self._vertices[self._triangles[face]])
+        squared = ((points[query] - closest) ** 2).sum(1)
+        nearest = np.full(len(points), np.inf)
+        np.minimum.at(nearest, query, squared)
+        slack = 1e-12 * scale * scale
+        tied = squared <= nearest[query] + slack
+        best = np.full(len(points), np.iinfo(np.int64).max)
+        np.minimum.at(best, query[tied], face[tied])
+        return best
+
+    def _touching(self, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Pairs (query, face): every face that shares a vertex with the query's proposed face."""
+        vertices = self._triangles[faces]
+        begin, end = self._start[vertices], self._start[vertices + 1]
+        counts = (end - begin).ravel()
+        query = np.repeat(np.repeat(np.arange(len(faces)), 3), counts)
+        first = np.repeat(begin.ravel() - np.concatenate([[0], np.cumsum(counts)[:-1]]), counts)
+        return query, self._face_of_corner[first + np.arange(counts.sum())]

@@ -1,0 +1,95 @@
+"""Reading a wrap pair and refusing one whose order was lost (paper, section 3.3)."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from soma_core.errors import AssetError, InputError
+from soma_core.rig.mesh import CanonicalMesh
+
+__all__ = ["check_wrap", "read_obj"]
+
+_LFS = b"version https://git-lfs"
+
+
+def read_obj(path: Path) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices (n, 3) float64 and triangles (t, 3) int64 of an OBJ, in the file's order, nothing merged."""
+    import trimesh
+
+    try:
+        with open(path, "rb") as stream:
+            head = stream.read(len(_LFS))
+    except OSError as error:
+        raise AssetError(
+            path, cause=f"cannot be read ({error.strerror})", fix="Reinstall the backend or name another file."
+        ) from error
+    if head == _LFS:
+        raise AssetError(path, cause="is a git-LFS pointer, not the mesh", fix="Run `git lfs pull` where it lies.")
+    mesh = trimesh.load(path, file_type="obj", process=False, maintain_order=True, force="mesh", skip_materials=True)
+    vertices, triangles = np.array(mesh.vertices, np.float64), np.array(mesh.faces, np.int64)
+    if not len(vertices) or not len(triangles):
+        raise AssetError(path, cause="holds no mesh", fix="Export it again with vertices and faces.")
+    if not np.isfinite(vertices).all():
+        bad = int(np.flatnonzero(~np.isfinite(vertices).all(1))[0])
+        raise AssetError(path, cause=f"vertex {bad} is not finite", fix="Export the mesh again.")
+    return vertices, triangles
+
+
+def _canonical_edges(mesh: CanonicalMesh) -> np.ndarray:
+    """Polygon edges as sorted, unique 64-bit keys."""
+    starts = np.concatenate([[0], np.cumsum(mesh.face_vert_counts)[:-1]])
+    corner = np.arange(len(mesh.face_vert_indices))
+    face = np.repeat(np.arange(len(starts)), mesh.face_vert_counts)
+    following = starts[face] + (corner - starts[face] + 1) % mesh.face_vert_counts[face]
+    return _edge_keys(mesh.face_vert_indices, mesh.face_vert_indices[following])
+
+
+def _edge_keys(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    low, high = np.minimum(a, b).astype(np.int64), np.maximum(a, b).astype(np.int64)
+    return np.unique(low << 32 | high)
+
+
+def check_wrap(vertices: np.ndarray, triangles: np.ndarray, mesh: CanonicalMesh, *, path: Path) -> None:
+    """Refuse a wrap of another vertex count, or whose vertices are not in canonical order."""
+    if len(vertices) != mesh.vertex_count:
+        raise InputError(
+            f"wrap {path}",
+            got=f"{len(vertices)} vertices",
+            expected=f"{mesh.vertex_count}, one for each canonical vertex",
+            fix="Export the wrap without merging, splitting or removing vertices.",
+        )
+    canonical = _canonical_edges(mesh)
+    keys = [
+        np.minimum(triangles[:, i], triangles[:, j]) << 32 | np.maximum(triangles[:, i], triangles[:, j])
+        for i, j in ((0, 1), (1, 2), (2, 0))
+    ]
+    on_edges = sum(np.isin(key, canonical).astype(int) for key in keys)
+    strange = int((on_edges < 2).sum())
+    if strange:
+        raise InputError(
+            f"wrap {path}",
+            got=f"{strange} of {len(triangles)} faces that do not exist in the canonical mesh",
+            expected="the canonical vertex order and faces",
+            fix="Export again with the vertex order kept (Blender: 'Keep Vertex Order'; trimesh: process=False).",
+        )
+    _refuse_long_edges(vertices, mesh, canonical, path)
+
+
+def _refuse_long_edges(vertices: np.ndarray, mesh: CanonicalMesh, edges: np.ndarray, path: Path) -> None:
+    """Catch a permutation applied to vertices and not to faces: neighbours would lie far apart."""
+    start, end = edges >> 32, edges & 0xFFFFFFFF
+
+    def relative(points: np.ndarray) -> float:
+        diagonal = float(np.linalg.norm(np.ptp(points, axis=0))) or 1.0
+        return float(np.linalg.norm(points[start] - points[end], axis=1).mean()) / diagonal
+
+    got, expected = relative(vertices), relative(mesh.vertices)
+    if got > 3 * expected:
+        raise InputError(
+            f"wrap {path}",
+            got=f"neighbouring vertices {got:.1%} of the body's diagonal apart",
+            expected=f"about {expected:.1%}, as on the canonical mesh",
+            fix="The vertices were reordered; export again with the vertex order kept.",
+        )
