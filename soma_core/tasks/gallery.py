@@ -1,0 +1,107 @@
+"""Draw identities of every installed backend in one pose (the paper's first figure)."""
+
+from __future__ import annotations
+
+import logging
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+
+from soma_core.errors import SomaError
+from soma_core.layer import SomaLayer
+from soma_core.plugin.errors import BackendError
+from soma_core.plugin.registry import default_registry
+from soma_core.plugin.spec import BackendSpec
+from soma_core.tasks.animate import animate, load_motion
+from soma_core.tasks.picture import Body, backend_colour, gallery
+
+if TYPE_CHECKING:
+    from omegaconf import DictConfig
+
+    from soma_core.io.motion import Motion
+
+__all__ = ["draw_gallery", "random_params"]
+
+_log = logging.getLogger(__name__)
+
+_IDENTITIES = 3
+"""Bodies a backend: its default and two random ones."""
+
+_POSE_SECOND = 10.75
+"""Second of the shipped clip that shows a pose with depth: a lifted knee, the arms swinging."""
+
+
+def draw_gallery(config: DictConfig, path: Path) -> None:
+    """Write one picture with identities of every usable backend in the same pose.
+
+    A backend that does not build is reported and left out.
+
+    Raises:
+        SomaError: no backend is usable, or pyvista is not installed.
+    """
+    motion = load_motion(config)
+    frame = motion.frame_count // 2 if config.motion else round(_POSE_SECOND * motion.fps)
+    pose = _one_frame(motion, min(frame, motion.frame_count - 1))
+    bodies = []
+    for name in default_registry().names():
+        try:
+            bodies += _bodies(name, config, pose)
+        except BackendError as error:
+            _log.warning("%s", error)
+    if not bodies:
+        raise SomaError("no backend is usable. Run: soma backends")
+    gallery(path, bodies, width=config.picture.width)
+    _log.info("wrote %d bodies", len(bodies))
+
+
+def _one_frame(motion: Motion, frame: int) -> Motion:
+    from dataclasses import replace
+
+    part = slice(frame, frame + 1)
+    return replace(motion, rotations=motion.rotations[part], translation=motion.translation[part])
+
+
+def _bodies(name: str, config: DictConfig, pose: Motion) -> list[Body]:
+    """The default identity of a backend, then random ones, posed and standing on the floor."""
+    layer = SomaLayer(name, lod=str(config.lod), device=config.device, kernels=str(config.kernels))
+    generator = np.random.default_rng(config.seed)
+    choices: list[dict[str, Any]] = [
+        {},
+        *(random_params(layer.spec, generator) for _ in range(_IDENTITIES - 1)),
+    ]
+    found = []
+    for params in choices:
+        with torch.no_grad():
+            identity = layer.identity(params)
+            vertices = animate(layer, identity, pose, keep=[0]).vertices[0]
+        height = float(np.ptp(identity.rest[0, :, 1].cpu().numpy()))
+        caption = f"{name}\n{height:.2f} m"
+        found.append(
+            Body(
+                vertices=vertices,
+                triangles=layer.mesh.triangles,
+                colour=backend_colour(name),
+                caption=caption,
+            )
+        )
+    return found
+
+
+def random_params(spec: BackendSpec, generator: np.random.Generator) -> dict[str, Any]:
+    """One random identity: vectors normal with a sixth of their range as deviation, scalars uniform.
+
+    Grouped parameters, of which there may be hundreds, keep their defaults.
+    """
+    found: dict[str, Any] = {}
+    for parameter in spec.params:
+        low, high = parameter.range
+        if parameter.group:
+            continue
+        if parameter.shape:
+            spread = generator.normal(parameter.default, (high - low) / 6, parameter.shape)
+            found[parameter.name] = np.clip(spread, low, high)
+        else:
+            found[parameter.name] = float(generator.uniform(low, high))
+    return found
