@@ -81,6 +81,7 @@ def _apply_rows(matrix, flat: Tensor) -> Tensor:
     for start in range(0, columns, 32):
         block = flat[:, start : start + 32].double().cpu().numpy().reshape(count, -1)
         parts.append((matrix @ block).reshape(matrix.shape[0] * 3, -1))
+    parts = parts or [np.empty((matrix.shape[0] * 3, 0))]
     return torch.as_tensor(np.hstack(parts), dtype=flat.dtype, device=flat.device)
 
 

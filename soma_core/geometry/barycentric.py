@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-__all__ = ["closest_point_on_triangle", "raised_normal", "tetrahedral_coordinates"]
+__all__ = ["closest_point_on_triangle", "raised_normal", "raised_normal_jacobian", "tetrahedral_coordinates"]
 
 
 def tetrahedral_coordinates(points: np.ndarray, corners: np.ndarray) -> np.ndarray:
@@ -56,6 +56,28 @@ def raised_normal(corners: Tensor) -> Tensor:
     normal = torch.linalg.cross(first, second, dim=-1)
     floor = 1e-20 * length**4 + tiny
     return normal * (length * torch.rsqrt(torch.maximum((normal * normal).sum(-1), floor)))[..., None]
+
+
+def raised_normal_jacobian(corners: np.ndarray) -> np.ndarray:
+    """Derivative of :func:`raised_normal` in the corners; (n, 3, 3) -> (n, 3, 3, 3).
+
+    Entry [:, i, k, j] is the derivative of component i in coordinate j of corner k:
+    ``d(l n) = n dl + l (I - n n^T)(de1 x e2 + e1 x de2) / |e1 x e2|``. Faces must not be degenerate.
+    """
+    first, second = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+    normal = np.cross(first, second)
+    area = np.linalg.norm(normal, axis=1)
+    unit = normal / area[:, None]
+    directions = [edge / np.linalg.norm(edge, axis=1)[:, None] for edge in (first, second, second - first)]
+    tangent = (np.eye(3) - unit[:, :, None] * unit[:, None, :]) * (_mean_edge(first, second) / area)[:, None, None]
+
+    def turn(vectors: np.ndarray) -> np.ndarray:
+        """Cross-product matrices of row vectors."""
+        return np.cross(vectors[:, None, :], np.eye(3)).transpose(0, 2, 1)
+
+    by_first = unit[:, :, None] * (directions[0] - directions[2])[:, None, :] / 3 - tangent @ turn(second)
+    by_second = unit[:, :, None] * (directions[1] + directions[2])[:, None, :] / 3 + tangent @ turn(first)
+    return np.stack([-by_first - by_second, by_first, by_second], 2)
 
 
 def closest_point_on_triangle(points: np.ndarray, corners: np.ndarray) -> np.ndarray:

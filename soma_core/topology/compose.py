@@ -9,10 +9,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numpy as np
+import scipy.sparse
 import torch
 from torch import Tensor
 
-from soma_core.geometry.barycentric import raised_normal
+from soma_core.geometry.barycentric import raised_normal, raised_normal_jacobian
+from soma_core.geometry.sparse import SparseRows
 from soma_core.plugin.spec import LinearBasis
 from soma_core.topology.transfer import CanonicalPassThrough, TopologyTransfer
 
@@ -21,7 +24,10 @@ __all__ = ["ComposedBasis", "ExactOffsets", "compose"]
 _REAL_OFFSET = 1e-5
 """Offset [m] above which a vertex's normal is evaluated exactly; below, linearising it costs < 0.01 mm."""
 
-_COLUMNS = 16
+_NO_OFFSET = 1e-8
+"""Offset [m] below which a vertex counts as lying on its face."""
+
+_COLUMNS = 32
 """Basis columns composed at a time, to bound memory."""
 
 
@@ -80,11 +86,14 @@ def compose(linear: LinearBasis, transfer: TopologyTransfer | CanonicalPassThrou
     if isinstance(transfer, CanonicalPassThrough):
         return _compose_pass_through(linear, transfer)
     count = len(transfer.corners)
-    offset = transfer.height.abs() * _native_edge(linear, transfer, at) * transfer.frame.norm(dim=1)[0]
+    default = torch.addmm(linear.template.reshape(1, -1), at[None], linear.basis.flatten(1)).view(-1, 3)
+    corners = default[transfer.corners]
+    scale = transfer.frame.norm(dim=1)[0]
+    offset = transfer.height.abs() * raised_normal(corners).norm(dim=-1) * scale
     exact_rows = torch.nonzero(offset > _REAL_OFFSET).squeeze(1)
-    approximate = transfer.height.clone()
-    approximate[exact_rows] = 0
-    corners_at = (linear.template + torch.einsum("k,knc->nc", at, linear.basis))[transfer.corners]
+    height = torch.where(offset > _REAL_OFFSET, 0.0, transfer.height)
+    height = torch.where(offset < _NO_OFFSET, 0.0, height)
+    slope = _slope_rows(transfer, corners, height)
 
     def finish(points: Tensor) -> Tensor:
         filled = transfer.fill(points.reshape(count, -1)).view(count, 3, -1)
@@ -92,26 +101,29 @@ def compose(linear: LinearBasis, transfer: TopologyTransfer | CanonicalPassThrou
 
     columns = torch.empty(count * 3, len(linear.basis), dtype=linear.basis.dtype, device=linear.basis.device)
     for start in range(0, len(linear.basis), _COLUMNS):
-        part = linear.basis[start : start + _COLUMNS]
-        plane = transfer.affine(part.permute(1, 2, 0).reshape(part.shape[1], -1)).view(count, 3, -1)
-        slope = torch.stack([_normal_slope(corners_at, column[transfer.corners]) for column in part], -1)
-        columns[:, start : start + _COLUMNS] = finish(plane + approximate[:, None, None] * slope)
-    constant = transfer.affine(linear.template.contiguous()).view(count, 3, 1)
-    constant = constant + (approximate[:, None] * raised_normal(corners_at))[..., None]
-    slope_at = _normal_slope(corners_at, corners_at - linear.template[transfer.corners])
-    constant = constant - (approximate[:, None] * slope_at)[..., None]
+        part = linear.basis[start : start + _COLUMNS].permute(1, 2, 0).contiguous()
+        plane = transfer.affine(part.flatten(1)) + slope(part.flatten(0, 1)).view(count, -1)
+        columns[:, start : start + _COLUMNS] = finish(plane)
+    raised = height[:, None] * raised_normal(corners)
+    change = (linear.template - default).reshape(-1, 1)
+    constant = transfer.affine(linear.template.contiguous()) + raised + slope(change).view(count, 3)
     return ComposedBasis(
         template=finish(constant).squeeze(1), basis=columns, exact=_exact_offsets(linear, transfer, exact_rows)
     )
 
 
-def _native_edge(linear: LinearBasis, transfer: TopologyTransfer, at: Tensor) -> Tensor:
-    corners = (linear.template + torch.einsum("k,knc->nc", at, linear.basis))[transfer.corners]
-    return raised_normal(corners).norm(dim=-1)
-
-
-def _normal_slope(corners: Tensor, direction: Tensor) -> Tensor:
-    return torch.func.jvp(raised_normal, (corners,), (direction,))[1]
+def _slope_rows(transfer: TopologyTransfer, corners: Tensor, height: Tensor) -> SparseRows:
+    """Sparse derivative (v * 3, n * 3) of the linearised offsets ``height * raised normal``."""
+    rows = torch.nonzero(height).squeeze(1).cpu().numpy()
+    jacobian = raised_normal_jacobian(corners.double().cpu().numpy()[rows])
+    jacobian = jacobian * height.double().cpu().numpy()[rows][:, None, None, None]
+    ids = transfer.corners.cpu().numpy()[rows]
+    row = np.broadcast_to((3 * rows[:, None] + np.arange(3))[:, :, None, None], jacobian.shape)
+    column = np.broadcast_to((3 * ids[:, :, None] + np.arange(3))[:, None], jacobian.shape)
+    matrix = scipy.sparse.csr_array(
+        (jacobian.ravel(), (row.ravel(), column.ravel())), shape=(3 * len(height), 3 * transfer.native_count)
+    )
+    return SparseRows(matrix, dtype=height.dtype, device=height.device)
 
 
 def _exact_offsets(linear: LinearBasis, transfer: TopologyTransfer, rows: Tensor) -> ExactOffsets | None:
