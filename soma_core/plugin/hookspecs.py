@@ -27,7 +27,7 @@ def soma_backend() -> BackendSpec:  # type: ignore[empty-body]
 
 
 @hookspec(firstresult=True)
-def soma_generator(
+def soma_generator(  # type: ignore[empty-body]
     spec: BackendSpec, device: torch.device, dtype: torch.dtype, options: Mapping[str, Any]
-) -> Generator:  # type: ignore[empty-body]
+) -> Generator:
     """Build the native generator on `device` with floating type `dtype`."""
