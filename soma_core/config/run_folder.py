@@ -74,7 +74,11 @@ class _OwnRecords(logging.Filter):
 
 @contextmanager
 def run_log(folder: Path) -> Iterator[None]:
-    """Send log records to stderr and to ``log.txt`` in `folder` while the run lasts."""
+    """Send log records to stderr and to ``log.txt`` in `folder` while the run lasts.
+
+    An error that ends the run is written into the file with its traceback; the terminal gets the
+    command line's one message instead.
+    """
     root = logging.getLogger()
     level = root.level
     file = logging.FileHandler(folder / "log.txt", encoding="utf-8")
@@ -88,6 +92,10 @@ def run_log(folder: Path) -> Iterator[None]:
         root.addHandler(handler)
     try:
         yield
+    except BaseException as error:
+        trace = sys.exc_info()
+        file.handle(_log.makeRecord(_log.name, logging.ERROR, __file__, 0, "%r", (error,), trace))
+        raise
     finally:
         for handler in handlers:
             root.removeHandler(handler)

@@ -85,6 +85,13 @@ def test_a_failed_job_does_not_end_the_others(run: Run) -> None:
     assert "seed: got 7" in str(second)
 
 
+def test_the_log_of_a_failed_run_keeps_the_traceback(run: Run, tmp_path: Path) -> None:
+    run("seed=7", "hydra.run.dir=failed")
+    text = (tmp_path / "failed" / "log.txt").read_text()
+    assert "seed: got 7" in text
+    assert "Traceback" in text
+
+
 def test_strict_lets_the_error_of_a_task_through(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("SOMA_STRICT", "1")
     with pytest.raises(InputError, match="seed: got 7"):
