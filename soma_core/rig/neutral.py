@@ -118,12 +118,13 @@ def read_arrays(path: Path, names: Iterable[str]) -> dict[str, np.ndarray]:
     refuse_unreadable(path)
     fix = "Restore the file, or make it again with `soma assets build`"
     try:
-        with np.load(path, allow_pickle=False) as file:
+        # np.load opened by name leaks its handle when the archive is broken.
+        with open(path, "rb") as stream, np.load(stream, allow_pickle=False) as file:
             missing = [name for name in names if name not in file.files]
             if not missing:
                 wanted = [*names, *(["metadata"] if "metadata" in file.files else [])]
                 return {name: file[name] for name in wanted}
-    except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
+    except (OSError, TypeError, ValueError, EOFError, zipfile.BadZipFile) as error:
         raise AssetError(path, cause=f"not a readable npz ({error})", fix=fix) from error
     raise AssetError(path, cause=f"missing keys {missing}", fix=fix)
 
@@ -137,6 +138,9 @@ def _read_metadata(path: Path, arrays: Mapping[str, np.ndarray]) -> dict[str, An
     except ValueError as error:
         cause = f"metadata is not JSON ({error})"
         raise AssetError(path, cause=cause, fix="Write it again with the tool that made it") from error
+    if not isinstance(metadata, dict):
+        cause = f"metadata is {type(metadata).__name__}, not a JSON object"
+        raise AssetError(path, cause=cause, fix="Write it again with the tool that made it")
     for key, accepted in _ACCEPTED.items():
         value = metadata.get(key, accepted[0])
         if str(value).lower() not in accepted:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import warnings
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -101,7 +102,10 @@ def read_source(folder: Path | None = None) -> SourceRig:
     import torch  # weights-only unpickler; slow to import, needed for building only
 
     folder = source_folder() if folder is None else folder
-    rig = torch.load(_pinned(folder, "soma_rig.pt"), weights_only=True)
+    with warnings.catch_warnings():
+        # torch 2.x announces its sparse CSR tensors as beta whenever one is read; we only densify it.
+        warnings.filterwarnings("ignore", message="Sparse CSR tensor support", category=UserWarning)
+        rig = torch.load(_pinned(folder, "soma_rig.pt"), weights_only=True)
     triangles = torch.load(_pinned(folder, "soma_faces.pt"), weights_only=True).numpy()
     quads, uv, uv_quads = _read_wrap(_pinned(folder, "SOMA_wrap.obj"))
     weights = rig["skinning_weights"].numpy()
