@@ -23,7 +23,8 @@ def compress_shape_space(space: ShapeSpace, *, rms_error: float = 0.002) -> Shap
         rms_error: wanted root mean square vertex displacement over all components [cm].
 
     Returns:
-        The rounded space; ``metadata["rounding"]`` holds the measured errors [mm].
+        The rounded space; ``metadata["rounding"]`` holds the measured errors [mm]. A space whose
+        values are multiples of such steps already comes back as it is.
     """
     if not space.component_count:
         return space
@@ -34,6 +35,8 @@ def compress_shape_space(space: ShapeSpace, *, rms_error: float = 0.002) -> Shap
     step = np.exp2(np.floor(np.log2(np.minimum(2 * share / sigma, largest))))[:, None]
     rounded = (np.round(space.shapedirs / step) * step).astype(np.float32)
     rounded += np.float32(0)  # -0.0 and 0.0 would be two symbols
+    if np.array_equal(rounded, space.shapedirs):
+        return space
     moved = (sigma[:, None] * (rounded.astype(np.float64) - space.shapedirs)).reshape(len(sigma), -1, 3)
     squared = np.square(moved).sum(axis=(0, 2))
     rounding = {
