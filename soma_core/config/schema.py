@@ -115,11 +115,15 @@ class TrainShapeConfig:
     """Configuration of ``soma train-shape``."""
 
     mix: dict[str, float] = field(default_factory=dict)
-    count: int = 20000
+    options: dict[str, Any] = field(default_factory=dict)
+    spread: float = 0.3
+    skip_groups: list[str] = field(default_factory=list)
+    count: int = 6000
     components: int = 128
-    batch: int = 512
+    batch: int = 256
     mirror: bool = True
-    held_out: int = 500
+    rounding_mm: float = 0.005
+    held_out: int = 200
     resume: bool = False
     seed: int = 0
     device: str = "cpu"

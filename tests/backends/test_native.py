@@ -62,7 +62,8 @@ def test_registry_builds_it_on_the_canonical_mesh():
 
 
 def test_declaring_does_not_import_torch():
-    code = "import sys; from soma_core.backends.native import soma_backend as b; b(); print('torch' in sys.modules)"
+    lines = ("import sys", "from soma_core.backends.native import soma_backend", "soma_backend()")
+    code = "; ".join((*lines, "print('torch' in sys.modules)"))
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "False"
 

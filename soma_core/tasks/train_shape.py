@@ -1,0 +1,186 @@
+"""``soma train-shape``: learn the native shape space from identities sampled from installed backends."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import json
+import logging
+import re
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from omegaconf import DictConfig, OmegaConf
+
+from soma_core.cache import atomic_write, content_key
+from soma_core.errors import InputError
+from soma_core.layer import SomaLayer
+from soma_core.paths import cache_dir
+from soma_core.plugin.registry import default_registry
+from soma_core.rig import load_canonical
+from soma_core.rig.mesh import CanonicalMesh
+from soma_core.rig.neutral import ShapeSpace
+from soma_core.shape_space.report import ErrorRow, plot_errors, reconstruction_errors
+from soma_core.shape_space.rounding import round_directions
+from soma_core.shape_space.sampling import HELD_OUT, IdentityStream
+from soma_core.shape_space.training import Components, TrainingPlan, train_components
+from soma_core.tasks.progress import progress
+
+__all__ = ["SHAPE_SPACE_FILE", "run", "write_shape_space"]
+
+_log = logging.getLogger(__name__)
+
+SHAPE_SPACE_FILE = "shape_space.npz"
+_CODE_VERSION = 1
+_CM_PER_M = 100.0
+_MM_PER_CM = 10.0
+
+
+def run(config: DictConfig, output: Path) -> None:
+    """Sample, train, measure on held-out identities, and write the shape space and its report.
+
+    Writes ``shape_space.npz`` (or the file `config.out`), ``report.json`` and, where matplotlib is
+    installed, ``reconstruction.png`` into `output`.
+
+    Raises:
+        InputError: a mixture, a plan or an option that cannot be used.
+        BackendError: a backend of the mixture is not usable.
+    """
+    _check_measures(config)
+    plan = TrainingPlan(
+        count=config.count, components=config.components, batch=config.batch, mirror=config.mirror
+    )
+    mesh, _ = load_canonical("mid")
+    stream = _identity_stream(config)
+    provenance = _provenance(config, mesh)
+    key = content_key(_CODE_VERSION, json.dumps(provenance, sort_keys=True), str(plan))
+    total = len(plan.batch_sizes)
+    components = train_components(
+        stream,
+        plan,
+        bind=_CM_PER_M * mesh.vertices,
+        partner=mesh.mirror,
+        state=cache_dir() / "train_shape" / f"{key}.npz",
+        key=key,
+        resume=config.resume,
+        progress=lambda steps, done: progress(steps, label="shape space, batch", total=total, done=done),
+    )
+    directions = round_directions(
+        components.directions, components.eigenvalues, config.rounding_mm / _MM_PER_CM
+    )
+    held_out = stream.shapes(HELD_OUT, 0, config.held_out)
+    errors = reconstruction_errors(components.mean, directions.astype(np.float64), held_out)
+    metadata = {**provenance, **_measured(components, directions, errors, config.held_out)}
+    space = ShapeSpace(
+        mean=components.mean.astype(np.float32),
+        shapedirs=directions,
+        eigenvalues=components.eigenvalues.astype(np.float32),
+        metadata=metadata,
+    )
+    write_shape_space(Path(config.out) if config.out else output / SHAPE_SPACE_FILE, space)
+    text = json.dumps(metadata, indent=2) + "\n"
+    atomic_write(output / "report.json", lambda path: _write_text(path, text))
+    if not plot_errors(errors, output / "reconstruction.png"):
+        _log.info("matplotlib is not installed: report.json has the numbers, there is no plot")
+
+
+def write_shape_space(path: Path, space: ShapeSpace) -> None:
+    """Write a shape-space file, which ``soma assets build --shape-space`` takes; atomic, deflated."""
+    arrays = {"mean": space.mean, "shapedirs": space.shapedirs, "eigenvalues": space.eigenvalues}
+    text = json.dumps(dict(space.metadata), sort_keys=True)
+    atomic_write(path, lambda part: np.savez_compressed(part, metadata=np.array(text), **arrays))
+
+
+def _check_measures(config: DictConfig) -> None:
+    if not config.rounding_mm > 0:
+        raise InputError(
+            "rounding_mm", got=config.rounding_mm, expected="a number above 0", fix="Try rounding_mm=0.005."
+        )
+    if config.held_out < 1:
+        raise InputError("held_out", got=config.held_out, expected="at least 1", fix="Try held_out=200.")
+
+
+def _identity_stream(config: DictConfig) -> IdentityStream:
+    options = OmegaConf.to_container(config.options, resolve=True)
+    layers = {
+        name: SomaLayer(name, options=options.get(name), device=config.device, dtype=torch.float32)
+        for name in config.mix
+    }
+    return IdentityStream(
+        layers,
+        dict(config.mix),
+        seed=config.seed,
+        spread=config.spread,
+        skip_groups=list(config.skip_groups),
+    )
+
+
+def _provenance(config: DictConfig, mesh: CanonicalMesh) -> dict[str, Any]:
+    """What the space is trained on, in a form that can be stored."""
+    options = OmegaConf.to_container(config.options, resolve=True)
+    return {
+        "units": "cm",
+        "up_axis": "+y",
+        "forward_axis": "+z",
+        "handedness": "right",
+        "pose": "bind, lowest vertex at height 0",
+        "rig_revision": mesh.revision,
+        "trained_on": [
+            {**_origin(name), "share": share, "options": options.get(name, {})}
+            for name, share in config.mix.items()
+        ],
+        "identities": config.count,
+        "mirror_images": config.mirror,
+        "seed": config.seed,
+        "batch": config.batch,
+        "spread": config.spread,
+        "skipped_groups": list(config.skip_groups),
+        "rounding_mm": config.rounding_mm,
+    }
+
+
+def _origin(name: str) -> dict[str, Any]:
+    """Distribution, licence and versions behind backend `name`."""
+    registry = default_registry()
+    spec = registry.spec(name)
+    entry = next(entry for entry in registry.entries() if entry.name == name)
+    return {
+        "backend": name,
+        "distribution": entry.distribution,
+        "version": entry.version,
+        "requires": _installed_requirements(entry.distribution),
+        "licence": spec.licence,
+        "url": spec.url,
+    }
+
+
+def _installed_requirements(distribution: str) -> Mapping[str, str]:
+    """Versions of what `distribution` directly requires, extras left out."""
+    try:
+        requirements = importlib.metadata.requires(distribution) or []
+    except importlib.metadata.PackageNotFoundError:
+        return {}
+    names = [re.split(r"[^A-Za-z0-9._-]", line)[0] for line in requirements if "extra ==" not in line]
+    installed = {item.metadata["Name"].lower(): item.version for item in importlib.metadata.distributions()}
+    return {name: installed[name.lower()] for name in names if name.lower() in installed}
+
+
+def _measured(
+    components: Components, directions: np.ndarray, errors: list[ErrorRow], held_out: int
+) -> dict[str, Any]:
+    deviation = np.sqrt(components.eigenvalues)[:, None]
+    rounding = np.abs(directions - components.directions) * deviation
+    return {
+        "shapes": components.shapes,
+        "components": len(components.eigenvalues),
+        "explained_variance": round(float(components.explained.sum()), 8),
+        "rounding_error_mm": round(_MM_PER_CM * float(rounding.max()), 6),
+        "held_out_identities": held_out,
+        "held_out_errors": errors,
+    }
+
+
+def _write_text(path: Path, text: str) -> None:
+    path.write_text(text, encoding="utf-8")

@@ -1,0 +1,32 @@
+"""Progress: steps pass through unchanged; plain lines where there is no terminal, a bar where there is."""
+
+import io
+import logging
+
+from soma_core.tasks.progress import progress
+
+
+def test_plain_lines_count_every_step(caplog, monkeypatch):
+    monkeypatch.setattr("sys.stderr", io.StringIO())
+    with caplog.at_level(logging.INFO):
+        assert list(progress(range(2, 6), label="work", total=6, done=2)) == [2, 3, 4, 5]
+    assert [record.message for record in caplog.records] == [
+        f"work: {number} of 6" for number in (3, 4, 5, 6)
+    ]
+
+
+def test_long_work_prints_a_bounded_number_of_lines(caplog, monkeypatch):
+    monkeypatch.setattr("sys.stderr", io.StringIO())
+    with caplog.at_level(logging.INFO):
+        list(progress(range(1000), label="work", total=1000, lines=10))
+    assert len(caplog.records) == 10
+
+
+def test_a_terminal_gets_a_bar(caplog, monkeypatch):
+    terminal = io.StringIO()
+    terminal.isatty = lambda: True
+    monkeypatch.setattr("sys.stderr", terminal)
+    with caplog.at_level(logging.INFO):
+        assert list(progress("abc", label="work", total=3)) == ["a", "b", "c"]
+    assert "work: 100%" in terminal.getvalue()
+    assert not caplog.records
