@@ -24,9 +24,9 @@ def compress_shape_space(space: ShapeSpace, *, rms_error: float = 0.002) -> Shap
 
     Returns:
         The rounded space; ``metadata["rounding"]`` holds the measured errors [mm]. A space whose
-        values are multiples of such steps already comes back as it is.
+        metadata says that it was rounded before comes back as it is: the errors would add up unseen.
     """
-    if not space.component_count:
+    if not space.component_count or any(key.startswith("rounding") for key in space.metadata):
         return space
     share = rms_error / math.sqrt(space.component_count)
     sigma = np.sqrt(np.maximum(space.eigenvalues.astype(np.float64), np.finfo(np.float32).tiny))
@@ -35,8 +35,6 @@ def compress_shape_space(space: ShapeSpace, *, rms_error: float = 0.002) -> Shap
     step = np.exp2(np.floor(np.log2(np.minimum(2 * share / sigma, largest))))[:, None]
     rounded = (np.round(space.shapedirs / step) * step).astype(np.float32)
     rounded += np.float32(0)  # -0.0 and 0.0 would be two symbols
-    if np.array_equal(rounded, space.shapedirs):
-        return space
     moved = (sigma[:, None] * (rounded.astype(np.float64) - space.shapedirs)).reshape(len(sigma), -1, 3)
     squared = np.square(moved).sum(axis=(0, 2))
     rounding = {
