@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
-from tqdm import tqdm
 
 from soma_core.errors import InputError
 from soma_core.io.clip import skinned_clip
@@ -22,10 +21,12 @@ from soma_core.io.usd import write_usd
 from soma_core.layer import SomaLayer
 from soma_core.paths import assets_dir
 from soma_core.tasks.picture import Body, backend_colour, contact_sheet
+from soma_core.tasks.progress import progress
 
 if TYPE_CHECKING:
     from omegaconf import DictConfig
 
+    from soma_core.animation.posed import Posed
     from soma_core.skeleton.identity import Identity
 
 __all__ = ["Animated", "animate", "given_params", "load_motion", "run"]
@@ -77,8 +78,8 @@ def run(config: DictConfig, output: Path) -> None:
     _log.info("%s: %d frames at %g fps", motion.source, motion.frame_count, motion.fps)
     with torch.no_grad():
         identity = layer.identity(params)
-        shown = np.unique(np.linspace(0, motion.frame_count - 1, config.picture.frames).round().astype(int))
-        result = animate(layer, identity, motion, translation=str(config.translation), keep=shown.tolist())
+        shown = _shown_frames(motion.frame_count, config.picture.frames)
+        result = animate(layer, identity, motion, translation=str(config.translation), keep=shown)
     motion = replace(result.motion, identity={"backend": layer.backend, "params": params})
     _write(config, output, layer, identity, replace(result, motion=motion))
 
@@ -101,6 +102,11 @@ def load_motion(config: DictConfig) -> Motion:
         translation=motion.translation[part],
         fps=motion.fps / part.step,
     )
+
+
+def _shown_frames(frame_count: int, count: int) -> list[int]:
+    """Middles of `count` equal parts of the clip: both its ends are often the same pose."""
+    return np.unique((np.arange(count) + 0.5) * frame_count / count).astype(int).tolist()
 
 
 def given_params(values: Mapping[str, Any]) -> dict[str, Any]:
@@ -158,16 +164,15 @@ def animate(
 
 def _posed_chunks(
     layer: SomaLayer, identity: Identity, motion: Motion, path: np.ndarray
-) -> Iterator[tuple[int, Any]]:
-    """First frame and posed body of each chunk, with a progress bar on a terminal."""
+) -> Iterator[tuple[int, Posed]]:
+    """First frame and posed body of each chunk."""
     absolute = motion.convention == "absolute_local"
-    with tqdm(total=motion.frame_count, desc="posing", unit="frame", disable=None, leave=False) as bar:
-        for start in range(0, motion.frame_count, _CHUNK):
-            part = slice(start, start + _CHUNK)
-            rotations = torch.as_tensor(motion.rotations[part], dtype=layer.dtype, device=layer.device)
-            hips = torch.as_tensor(path[part], dtype=layer.dtype, device=layer.device)
-            yield start, layer.pose(identity, rotations, hips, absolute=absolute)
-            bar.update(len(rotations))
+    starts = range(0, motion.frame_count, _CHUNK)
+    for start in progress(starts, label="posing", total=len(starts), lines=4):
+        part = slice(start, start + _CHUNK)
+        rotations = torch.as_tensor(motion.rotations[part], dtype=layer.dtype, device=layer.device)
+        hips = torch.as_tensor(path[part], dtype=layer.dtype, device=layer.device)
+        yield start, layer.pose(identity, rotations, hips, absolute=absolute)
 
 
 def _leg_length(world: np.ndarray, names: tuple[str, ...]) -> float:

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import logging
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -13,7 +14,7 @@ from soma_core.errors import SomaError
 from soma_core.layer import SomaLayer
 from soma_core.plugin.errors import BackendError
 from soma_core.plugin.registry import default_registry
-from soma_core.plugin.spec import BackendSpec
+from soma_core.shape_space.sampling import sample_parameters
 from soma_core.tasks.animate import animate, load_motion
 from soma_core.tasks.picture import Body, backend_colour, gallery
 
@@ -22,7 +23,7 @@ if TYPE_CHECKING:
 
     from soma_core.io.motion import Motion
 
-__all__ = ["draw_gallery", "random_params"]
+__all__ = ["draw_gallery"]
 
 _log = logging.getLogger(__name__)
 
@@ -57,8 +58,6 @@ def draw_gallery(config: DictConfig, path: Path) -> None:
 
 
 def _one_frame(motion: Motion, frame: int) -> Motion:
-    from dataclasses import replace
-
     part = slice(frame, frame + 1)
     return replace(motion, rotations=motion.rotations[part], translation=motion.translation[part])
 
@@ -67,10 +66,9 @@ def _bodies(name: str, config: DictConfig, pose: Motion) -> list[Body]:
     """The default identity of a backend, then random ones, posed and standing on the floor."""
     layer = SomaLayer(name, lod=str(config.lod), device=config.device, kernels=str(config.kernels))
     generator = np.random.default_rng(config.seed)
-    choices: list[dict[str, Any]] = [
-        {},
-        *(random_params(layer.spec, generator) for _ in range(_IDENTITIES - 1)),
-    ]
+    groups = {parameter.group for parameter in layer.spec.params} - {""}  # hundreds of details: left alone
+    random = sample_parameters(layer.spec, _IDENTITIES - 1, generator, skip_groups=groups)
+    choices = [{}, *({key: rows[i] for key, rows in random.items()} for i in range(_IDENTITIES - 1))]
     found = []
     for params in choices:
         with torch.no_grad():
@@ -86,22 +84,4 @@ def _bodies(name: str, config: DictConfig, pose: Motion) -> list[Body]:
                 caption=caption,
             )
         )
-    return found
-
-
-def random_params(spec: BackendSpec, generator: np.random.Generator) -> dict[str, Any]:
-    """One random identity: vectors normal with a sixth of their range as deviation, scalars uniform.
-
-    Grouped parameters, of which there may be hundreds, keep their defaults.
-    """
-    found: dict[str, Any] = {}
-    for parameter in spec.params:
-        low, high = parameter.range
-        if parameter.group:
-            continue
-        if parameter.shape:
-            spread = generator.normal(parameter.default, (high - low) / 6, parameter.shape)
-            found[parameter.name] = np.clip(spread, low, high)
-        else:
-            found[parameter.name] = float(generator.uniform(low, high))
     return found

@@ -8,7 +8,7 @@ import os
 import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -90,7 +90,7 @@ def contact_sheet(path: Path, bodies: Sequence[Body], *, width: int = 1600, colu
     cells = []
     with _stage(cell) as stage:
         for body, centre in zip(bodies, middle, strict=True):
-            focus = (centre[0], floor + height * 0.46, centre[2])
+            focus = (centre[0], floor + height * 0.45, centre[2])
             shot = stage.shot([body], focus=focus, height=max(height, reach * cell[1] / cell[0]))
             cells.append(_faded(shot))
     atomic_write(path, lambda target: _grid(cells, bodies, columns).save(target, "PNG"))
@@ -108,36 +108,30 @@ def gallery(path: Path, bodies: Sequence[Body], *, width: int = 1600, columns: i
     Raises:
         SomaError: pyvista is not installed.
     """
-    rows = [bodies[start : start + columns] for start in range(0, len(bodies), columns)]
-    pitch = max(float(np.ptp(body.vertices[:, 0])) for body in bodies) * 0.96
-    top = max(float(body.vertices[:, 1].max()) for body in bodies)
-    span = pitch * min(columns, len(bodies))
-    size = (width, int(width * max(top * 1.12 / span, 0.2)))
+    rows = [_line(bodies[start : start + columns]) for start in range(0, len(bodies), columns)]
+    top = max(float(body.vertices[:, 1].max()) for body in bodies) * 1.14
+    span = max(*(width for _, _, width in rows), 1.5 * top)
     pictures = []
-    with _stage(size) as stage:
-        for row in rows:
-            line, places = _side_by_side(row, pitch)
-            picture = stage.shot(line, focus=(0, top * 0.47, 0), height=top * 1.12, flat=True)
-            pictures.append(_captioned(picture, row, (places / span + 0.5) * width))
+    with _stage((width, int(width * top / span))) as stage:
+        for line, places, _ in rows:
+            picture = stage.shot(line, focus=(0, top * 0.45, 0), height=top, flat=True)
+            pictures.append(_captioned(picture, line, (places / span + 0.5) * width))
     atomic_write(path, lambda target: _stacked(pictures).save(target, "PNG"))
 
 
-def _side_by_side(bodies: Sequence[Body], pitch: float) -> tuple[list[Body], np.ndarray]:
-    """Move bodies along x; returns them with the place of each."""
-    places = (np.arange(len(bodies)) - (len(bodies) - 1) / 2) * pitch
+def _line(bodies: Sequence[Body], *, gap: float = 0.16) -> tuple[list[Body], np.ndarray, float]:
+    """Turn bodies a little and line them up along x: bodies, their places and the width of the line [m]."""
+    turn = np.radians(-_AZIMUTH)
+    spin = np.array([[np.cos(turn), 0, np.sin(turn)], [0, 1, 0], [-np.sin(turn), 0, np.cos(turn)]])
+    turned = [body.vertices @ spin.T for body in bodies]
+    widths = np.array([np.ptp(vertices[:, 0]) + gap for vertices in turned])
+    places = np.cumsum(widths) - widths / 2 - widths.sum() / 2
     moved = []
-    for body, place in zip(bodies, places, strict=True):
-        middle = (body.vertices.min(axis=0) + body.vertices.max(axis=0)) / 2
+    for body, vertices, place in zip(bodies, turned, places, strict=True):
+        middle = (vertices.min(axis=0) + vertices.max(axis=0)) / 2
         shift = np.array([place - middle[0], 0, -middle[2]])
-        moved.append(
-            Body(
-                vertices=body.vertices + shift,
-                triangles=body.triangles,
-                colour=body.colour,
-                caption=body.caption,
-            )
-        )
-    return moved, places
+        moved.append(replace(body, vertices=vertices + shift))
+    return moved, places, float(widths.sum() + gap)
 
 
 @contextmanager
@@ -190,7 +184,7 @@ class _Stage:
             )
             light.positional = False
             self._plotter.add_light(light)
-        self._plotter.enable_ssao(radius=0.12, bias=0.004, kernel_size=96)
+        self._plotter.enable_ssao(radius=0.12, bias=0.004, kernel_size=48)
         self._plotter.show(auto_close=False)  # a plotter that was never shown keeps its first picture
 
     def close(self) -> None:
@@ -269,7 +263,7 @@ def _faded(cell: Image) -> Image:
 
     wide, tall = cell.size
     across = np.minimum(np.arange(wide), np.arange(wide)[::-1]) / (0.07 * wide)
-    below = np.arange(tall)[::-1] / (0.05 * tall)
+    below = np.arange(tall)[::-1] / (0.035 * tall)
     ramp = np.clip(np.minimum(across[None], below[:, None]), 0, 1)
     mask = Image.fromarray((255 * ramp**2 * (3 - 2 * ramp)).astype(np.uint8))
     return Image.composite(cell, Image.new("RGB", cell.size, _rgb(_PAPER)), mask)

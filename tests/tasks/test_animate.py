@@ -1,0 +1,180 @@
+"""The main job on the native backend: files that re-open to the same body, and bodies that stand."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from omegaconf import OmegaConf
+from scipy.spatial.transform import Rotation
+
+from soma_core.config.schema import AnimateConfig
+from soma_core.errors import InputError
+from soma_core.io import read_motion, write_motion
+from soma_core.layer import SomaLayer
+from soma_core.tasks import animate as task
+
+GROUND_TOLERANCE = 1e-5
+"""Height of the lowest vertex [m]: float32 rounding at the size of a body."""
+
+UP = np.array([0, 3, 0])
+
+FILE_TOLERANCE_MM = 0.1
+"""Largest distance between a re-opened USD file and the posed body."""
+
+
+def configured(**changes):
+    settings = {"backend": {"name": "soma"}, "lod": "low", "frames": {"start": 0, "stop": 60, "step": 20}}
+    return OmegaConf.merge(OmegaConf.structured(AnimateConfig), settings | changes)
+
+
+@pytest.fixture(scope="module")
+def layer():
+    return SomaLayer("soma", lod="low")
+
+
+@pytest.fixture(scope="module")
+def identity(layer):
+    return layer.identity({})
+
+
+@pytest.fixture
+def motion():
+    return task.load_motion(configured())
+
+
+def lowest(result):
+    return min(vertices[:, 1].min() for vertices in result.vertices.values())
+
+
+def test_run_writes_what_is_asked_for(tmp_path):
+    task.run(configured(write=["npz", "usd", "glb"]), tmp_path)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["body.glb", "body.usdc", "motion.npz"]
+    written = read_motion(tmp_path / "motion.npz")
+    assert (written.frame_count, written.fps) == (3, 1.5)
+    assert written.identity == {"backend": "soma", "params": {}}
+    task.run(configured(write=[]), tmp_path / "nothing")
+    assert not (tmp_path / "nothing").exists()
+
+
+def test_written_motion_and_usd_give_the_same_body(tmp_path, layer, identity):
+    pytest.importorskip("pxr", reason="usd-core is not installed")
+    from pxr import Usd, UsdGeom, UsdSkel
+
+    task.run(configured(write=["npz", "usd"]), tmp_path)
+    written = read_motion(tmp_path / "motion.npz")
+    with torch.no_grad():
+        rotations, hips = torch.as_tensor(written.rotations), torch.as_tensor(written.translation)
+        posed = layer.pose(identity, rotations, hips).vertices.numpy()
+    stage = Usd.Stage.Open(str(tmp_path / "body.usdc"))
+    cache, root = UsdSkel.Cache(), UsdSkel.Root(stage.GetDefaultPrim())
+    cache.Populate(root, Usd.PrimDefaultPredicate)
+    mesh = UsdGeom.Mesh(root.GetPrim().GetChild("Mesh"))
+    skinning = cache.GetSkinningQuery(mesh.GetPrim())
+    skeleton = cache.GetSkelQuery(UsdSkel.Skeleton(root.GetPrim().GetChild("Skeleton")))
+    for frame in range(len(posed)):
+        points = mesh.GetPointsAttr().Get()
+        skinning.ComputeSkinnedPoints(skeleton.ComputeSkinningTransforms(frame), points, frame)
+        error = np.linalg.norm(np.array(points) - posed[frame], axis=1).max()
+        assert error * 1000 < FILE_TOLERANCE_MM
+
+
+def test_picture_is_written(tmp_path):
+    pytest.importorskip("pyvista", reason="pictures need pyvista")
+    task.run(configured(write=["png"], picture={"frames": 2, "width": 200}), tmp_path)
+    assert (tmp_path / "contact_sheet.png").stat().st_size > 1000
+
+
+def test_gallery_of_all_backends(tmp_path, monkeypatch):
+    pytest.importorskip("pyvista", reason="pictures need pyvista")
+    monkeypatch.setenv("SOMA_BACKENDS", "soma")
+    task.run(configured(backends="all", frames={}, picture={"width": 300}), tmp_path)
+    assert [path.name for path in tmp_path.iterdir()] == ["gallery.png"]
+
+
+def test_ground_puts_the_lowest_vertex_on_the_floor(layer, identity, motion):
+    lifted = replace(motion, translation=motion.translation + UP)
+    for mode in ("ground", "none"):
+        result = task.animate(layer, identity, lifted, translation=mode, keep=list(range(3)))
+        assert abs(lowest(result)) < GROUND_TOLERANCE
+        np.testing.assert_array_equal(result.transforms[:, 0], np.tile(np.eye(4), (3, 1, 1)))
+        np.testing.assert_allclose(
+            result.transforms[:, 1, :3, 3], result.motion.translation, atol=GROUND_TOLERANCE
+        )
+
+
+def test_motion_is_taken_as_recorded(layer, identity, motion):
+    lifted = replace(motion, translation=motion.translation + UP)
+    result = task.animate(layer, identity, lifted, translation="motion", keep=[0])
+    np.testing.assert_array_equal(result.motion.translation, lifted.translation)
+    assert lowest(result) > 2
+
+
+def test_none_keeps_the_hips_where_they_are(layer, identity, motion):
+    result = task.animate(
+        layer, identity, replace(motion, translation=motion.translation * 7), translation="none"
+    )
+    assert np.ptp(result.motion.translation, axis=0).max() == 0
+
+
+def test_a_small_body_takes_small_steps(layer, identity, motion):
+    bind = identity.bind_world.clone()
+    bind[..., :3, 3] /= 2
+    half = replace(identity, rest=identity.rest / 2, bind_world=bind)
+    walk = replace(motion, translation=motion.translation + np.arange(3)[:, None] * [0.0, 0.0, 1.0])
+    whole = task.animate(layer, identity, walk).motion.translation
+    short = task.animate(layer, half, walk).motion.translation
+    np.testing.assert_allclose(np.diff(short, axis=0), np.diff(whole, axis=0) / 2, atol=1e-5)
+
+
+def test_chunks_do_not_show(layer, identity, monkeypatch):
+    motion = task.load_motion(configured(frames={"step": 60}))
+    whole = task.animate(layer, identity, motion, keep=[0, 5])
+    monkeypatch.setattr(task, "_CHUNK", 3)
+    parts = task.animate(layer, identity, motion, keep=[0, 5])
+    np.testing.assert_allclose(parts.transforms, whole.transforms, atol=GROUND_TOLERANCE)
+    np.testing.assert_allclose(parts.vertices[5], whole.vertices[5], atol=GROUND_TOLERANCE)
+
+
+def test_absolute_rotations_give_the_same_body(layer, identity, motion):
+    orient = np.concatenate([np.eye(3)[None], layer.rig.t_pose_world[1:, :3, :3]])
+    relative = motion.rotations.astype(float)
+    local = np.swapaxes(orient[layer.rig.parents[1:]], -1, -2) @ relative @ orient[1:]
+    absolute = replace(motion, rotations=local, convention="absolute_local")
+    a = task.animate(layer, identity, motion, keep=[2]).vertices[2]
+    b = task.animate(layer, identity, absolute, keep=[2]).vertices[2]
+    np.testing.assert_allclose(a, b, atol=GROUND_TOLERANCE)
+
+
+def test_another_rig(layer, identity, motion):
+    foreign = replace(motion, rig_revision="f" * 16)
+    assert task.animate(layer, identity, foreign).motion.rig_revision == layer.rig.revision
+    with pytest.raises(InputError, match=r"rig_revision: got ffffffffffffffff"):
+        task.animate(layer, identity, replace(foreign, convention="absolute_local"))
+
+
+def test_frames_outside_the_motion_are_refused():
+    with pytest.raises(InputError, match=r"frames: got start=5000.*inside the 421 frames"):
+        task.load_motion(configured(frames={"start": 5000}))
+    with pytest.raises(InputError, match=r"frames: got start=0, stop=None, step=0"):
+        task.load_motion(configured(frames={"step": 0}))
+
+
+def test_unknown_translation_is_refused(layer, identity, motion):
+    with pytest.raises(InputError, match=r"translation: got 'sideways'"):
+        task.animate(layer, identity, motion, translation="sideways")
+
+
+def test_a_motion_is_found_from_the_current_folder(motion, tmp_path, monkeypatch):
+    turned = Rotation.from_euler("y", 40, degrees=True).as_matrix()
+    rotations = motion.rotations.copy()
+    rotations[:, 0] = turned @ rotations[:, 0]
+    write_motion(replace(motion, rotations=rotations), tmp_path / "turned.npz")
+    monkeypatch.chdir(tmp_path)
+    found = task.load_motion(configured(motion="turned.npz", frames={"start": 1, "stop": 2}))
+    np.testing.assert_array_equal(found.rotations, rotations[1:2])
+
+
+def test_null_parameters_take_their_default():
+    values = OmegaConf.create({"age": None, "weight": 0.3, "shape": [1, 2]})
+    assert task.given_params(values) == {"weight": 0.3, "shape": [1, 2]}

@@ -1,0 +1,80 @@
+"""Pictures show what they were given: every cell its own body, nobody cut off."""
+
+import sys
+
+import numpy as np
+import pytest
+
+from soma_core.errors import SomaError
+from soma_core.tasks.picture import Body, backend_colour, contact_sheet, gallery
+
+PIL = pytest.importorskip("PIL.Image", reason="pictures need pyvista and Pillow")
+
+
+def box(width, height, colour):
+    """A box that stands on the floor."""
+    corners = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], float) - [0.5, 0, 0.5]
+    quads = np.array([[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]])
+    triangles = np.concatenate([quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]])
+    return Body(
+        vertices=corners * [width, height, 0.3], triangles=triangles, colour=colour, caption="a box\n1 m"
+    )
+
+
+def painted(path, colour):
+    """Which pixels have the hue of `colour`, (rows, columns)."""
+    with PIL.open(path) as picture:
+        pixels = np.asarray(picture, float)
+    channel = int(np.argmax(colour))
+    others = np.delete(pixels, channel, axis=2).max(axis=2)
+    return pixels[..., channel] > others + 40
+
+
+@pytest.fixture(scope="module")
+def pyvista():
+    return pytest.importorskip("pyvista", reason="pictures need pyvista")
+
+
+def test_contact_sheet_draws_each_frame_anew(pyvista, tmp_path):
+    red = (0.9, 0.2, 0.2)
+    bodies = [box(0.4, height, red) for height in (1.8, 0.9, 0.45)]
+    contact_sheet(tmp_path / "sheet.png", bodies, width=300, columns=3)
+    mask = painted(tmp_path / "sheet.png", red)
+    assert mask.shape[1] == 300
+    heights = [np.ptp(np.flatnonzero(mask[:, start : start + 100].any(axis=1))) for start in (0, 100, 200)]
+    assert heights[0] > 1.5 * heights[1] > 2 * heights[2] > 0
+    assert not mask[[0, -1]].any()
+    assert not mask[:, [0, 99, 100, 199, 200, 299]].any()
+
+
+def test_contact_sheet_wraps_into_rows(pyvista, tmp_path):
+    contact_sheet(tmp_path / "a.png", [box(0.5, 1.5, (0.2, 0.8, 0.2))] * 3, width=200, columns=2)
+    contact_sheet(tmp_path / "b.png", [box(0.5, 1.5, (0.2, 0.8, 0.2))] * 2, width=200, columns=2)
+    with PIL.open(tmp_path / "a.png") as two_rows, PIL.open(tmp_path / "b.png") as one_row:
+        assert two_rows.height == 2 * one_row.height
+
+
+def test_gallery_shows_every_body_whole(pyvista, tmp_path):
+    colours = [(0.9, 0.2, 0.2), (0.2, 0.8, 0.2), (0.2, 0.3, 0.9)]
+    bodies = [box(width, 1.7, colour) for width, colour in zip((0.4, 1.6, 0.6), colours, strict=True)]
+    gallery(tmp_path / "gallery.png", bodies, width=400)
+    middles = []
+    for colour in colours:
+        columns = np.flatnonzero(painted(tmp_path / "gallery.png", colour).any(axis=0))
+        assert columns.min() > 0
+        assert columns.max() < 399
+        middles.append(columns.mean())
+    assert middles == sorted(middles)
+
+
+def test_missing_pyvista_is_named_with_the_pip_line(monkeypatch, tmp_path):
+    monkeypatch.setitem(sys.modules, "pyvista", None)
+    with pytest.raises(SomaError, match=r"need pyvista.*pip install 'soma-body-core\[render\]'"):
+        gallery(tmp_path / "gallery.png", [box(1, 1, (1, 0, 0))])
+    assert not list(tmp_path.iterdir())
+
+
+def test_colours_are_steady_and_distinct():
+    assert backend_colour("mybody") == backend_colour("mybody")
+    names = ("soma", "anny", "mhr", "mybody", "other")
+    assert len({backend_colour(name) for name in names}) == len(names)
