@@ -88,7 +88,7 @@ class FrameRange:
 class Picture:
     """The contact sheet: how many frames, and its width in pixels."""
 
-    frames: int = 5
+    frames: int = 10
     width: int = 1600
 
 
@@ -122,7 +122,6 @@ class TrainShapeConfig:
     components: int = 128
     batch: int = 256
     mirror: bool = True
-    rounding_mm: float = 0.005
     held_out: int = 200
     resume: bool = False
     seed: int = 0

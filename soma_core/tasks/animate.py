@@ -168,7 +168,8 @@ def _posed_chunks(
     """First frame and posed body of each chunk."""
     absolute = motion.convention == "absolute_local"
     starts = range(0, motion.frame_count, _CHUNK)
-    for start in progress(starts, label="posing", total=len(starts), lines=4):
+    shown = progress(starts, label="posing", total=len(starts), lines=4) if len(starts) > 1 else starts
+    for start in shown:
         part = slice(start, start + _CHUNK)
         rotations = torch.as_tensor(motion.rotations[part], dtype=layer.dtype, device=layer.device)
         hips = torch.as_tensor(path[part], dtype=layer.dtype, device=layer.device)
