@@ -33,7 +33,7 @@ def reconstruction_errors(
 
     Args:
         mean: (v, 3) [cm].
-        directions: (components, 3 v), nearly orthonormal (rounding allowed).
+        directions: (components, 3 v), orthonormal.
         shapes: (n, v, 3) [cm] that were not trained on.
         counts: numbers of components, ascending.
     """

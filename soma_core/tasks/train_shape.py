@@ -23,7 +23,6 @@ from soma_core.rig import load_canonical
 from soma_core.rig.mesh import CanonicalMesh
 from soma_core.rig.neutral import ShapeSpace
 from soma_core.shape_space.report import ErrorRow, plot_errors, reconstruction_errors
-from soma_core.shape_space.rounding import round_directions
 from soma_core.shape_space.sampling import HELD_OUT, IdentityStream
 from soma_core.shape_space.training import Components, TrainingPlan, train_components
 from soma_core.tasks.progress import progress
@@ -35,7 +34,6 @@ _log = logging.getLogger(__name__)
 SHAPE_SPACE_FILE = "shape_space.npz"
 _CODE_VERSION = 1
 _CM_PER_M = 100.0
-_MM_PER_CM = 10.0
 
 
 def run(config: DictConfig, output: Path) -> None:
@@ -48,7 +46,8 @@ def run(config: DictConfig, output: Path) -> None:
         InputError: a mixture, a plan or an option that cannot be used.
         BackendError: a backend of the mixture is not usable.
     """
-    _check_measures(config)
+    if config.held_out < 1:
+        raise InputError("held_out", got=config.held_out, expected="at least 1", fix="Try held_out=200.")
     plan = TrainingPlan(
         count=config.count, components=config.components, batch=config.batch, mirror=config.mirror
     )
@@ -67,15 +66,12 @@ def run(config: DictConfig, output: Path) -> None:
         resume=config.resume,
         progress=lambda steps, done: progress(steps, label="shape space, batch", total=total, done=done),
     )
-    directions = round_directions(
-        components.directions, components.eigenvalues, config.rounding_mm / _MM_PER_CM
-    )
     held_out = stream.shapes(HELD_OUT, 0, config.held_out)
-    errors = reconstruction_errors(components.mean, directions.astype(np.float64), held_out)
-    metadata = {**provenance, **_measured(components, directions, errors, config.held_out)}
+    errors = reconstruction_errors(components.mean, components.directions, held_out)
+    metadata = {**provenance, **_measured(components, errors, config.held_out)}
     space = ShapeSpace(
         mean=components.mean.astype(np.float32),
-        shapedirs=directions,
+        shapedirs=components.directions.astype(np.float32),
         eigenvalues=components.eigenvalues.astype(np.float32),
         metadata=metadata,
     )
@@ -87,19 +83,10 @@ def run(config: DictConfig, output: Path) -> None:
 
 
 def write_shape_space(path: Path, space: ShapeSpace) -> None:
-    """Write a shape-space file, which ``soma assets build --shape-space`` takes; atomic, deflated."""
+    """Write a shape-space file; ``soma assets build --shape-space FILE`` rounds it and merges it."""
     arrays = {"mean": space.mean, "shapedirs": space.shapedirs, "eigenvalues": space.eigenvalues}
     text = json.dumps(dict(space.metadata), sort_keys=True)
     atomic_write(path, lambda part: np.savez_compressed(part, metadata=np.array(text), **arrays))
-
-
-def _check_measures(config: DictConfig) -> None:
-    if not config.rounding_mm > 0:
-        raise InputError(
-            "rounding_mm", got=config.rounding_mm, expected="a number above 0", fix="Try rounding_mm=0.005."
-        )
-    if config.held_out < 1:
-        raise InputError("held_out", got=config.held_out, expected="at least 1", fix="Try held_out=200.")
 
 
 def _identity_stream(config: DictConfig) -> IdentityStream:
@@ -137,7 +124,6 @@ def _provenance(config: DictConfig, mesh: CanonicalMesh) -> dict[str, Any]:
         "batch": config.batch,
         "spread": config.spread,
         "skipped_groups": list(config.skip_groups),
-        "rounding_mm": config.rounding_mm,
     }
 
 
@@ -167,16 +153,11 @@ def _installed_requirements(distribution: str) -> Mapping[str, str]:
     return {name: installed[name.lower()] for name in names if name.lower() in installed}
 
 
-def _measured(
-    components: Components, directions: np.ndarray, errors: list[ErrorRow], held_out: int
-) -> dict[str, Any]:
-    deviation = np.sqrt(components.eigenvalues)[:, None]
-    rounding = np.abs(directions - components.directions) * deviation
+def _measured(components: Components, errors: list[ErrorRow], held_out: int) -> dict[str, Any]:
     return {
         "shapes": components.shapes,
         "components": len(components.eigenvalues),
         "explained_variance": round(float(components.explained.sum()), 8),
-        "rounding_error_mm": round(_MM_PER_CM * float(rounding.max()), 6),
         "held_out_identities": held_out,
         "held_out_errors": errors,
     }

@@ -9,7 +9,6 @@ from soma_core.errors import InputError
 from soma_core.rig import load_canonical
 from soma_core.shape_space.mirror import mirror_shapes
 from soma_core.shape_space.report import plot_errors, reconstruction_errors
-from soma_core.shape_space.rounding import round_directions
 from soma_core.shape_space.training import TrainingPlan, train_components
 
 VERTICES = 30
@@ -161,15 +160,3 @@ def test_no_plot_without_matplotlib(tmp_path, monkeypatch):
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
     assert not plot_errors([], tmp_path / "errors.png")
     assert not list(tmp_path.iterdir())
-
-
-def test_rounding_moves_no_vertex_by_more_than_half_a_step():
-    random = np.random.default_rng(0)
-    directions = np.linalg.qr(random.normal(size=(90, 4)))[0].T
-    eigenvalues = np.array([900.0, 4.0, 0.25, 0.0])
-    rounded = round_directions(directions, eigenvalues, 0.01)
-    moved = np.abs(rounded - directions) * np.sqrt(eigenvalues)[:, None]
-    assert rounded.dtype == np.float32
-    assert moved.max() <= 0.005
-    # At most 12 significant bits are left of 24 where the values reach 0.3 standard deviations of 2 cm.
-    assert not (rounded[1].view(np.uint32) & 0xFFF).any()

@@ -58,7 +58,6 @@ def test_writes_a_shape_space_that_loads_and_its_report(config, tmp_path):
     assert (report["identities"], report["shapes"], report["seed"]) == (12, 24, 0)
     assert report["rig_revision"] == load_canonical("mid")[0].revision
     assert [row["components"] for row in report["held_out_errors"]] == [1, 2, 4]
-    assert report["rounding_error_mm"] <= config.rounding_mm
     assert not list((tmp_path / "cache" / "train_shape").glob("*"))
 
 
@@ -77,10 +76,7 @@ def test_out_names_another_file(config, tmp_path):
     assert not (tmp_path / "shape_space.npz").exists()
 
 
-def test_unusable_rounding_is_named(config, tmp_path):
-    config.rounding_mm = 0.0
-    with pytest.raises(InputError, match=r"rounding_mm: got 0.0, expected a number above 0"):
-        train_shape.run(config, tmp_path)
-    config.rounding_mm, config.held_out = 0.01, 0
+def test_unusable_number_of_held_out_identities_is_named(config, tmp_path):
+    config.held_out = 0
     with pytest.raises(InputError, match=r"held_out: got 0, expected at least 1"):
         train_shape.run(config, tmp_path)

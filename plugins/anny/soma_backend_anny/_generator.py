@@ -86,13 +86,14 @@ class AnnyGenerator:
             if name in enabled:
                 continue
             local = name not in _basis.PHENOTYPES
-            option = f"local_changes: [{name}]" if local else "phenotypes: all"
+            option, value = ("local_changes", [name]) if local else ("phenotypes", "all")
             current = f"{len(self._local_changes)} local changes" if local else "the six default phenotypes"
+            override = f"backend.options.{option}=" + (f"[{name}]" if local else "all")
             raise InputError(
                 f"params[{name!r}]",
                 got=f"{name!r}, but the Anny backend was built with {current}",
                 expected="a parameter that the backend's options enable",
-                fix=f"Build it with the option {option} (local_changes: all enables every local change).",
+                fix=f"Add {override} to the command, or pass options={{{option!r}: {value!r}}} in Python.",
             )
 
 

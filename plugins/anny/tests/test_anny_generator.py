@@ -158,8 +158,16 @@ def test_dtype_follows_the_request():
     [
         ({"phenotypes": "some"}, {}, r"options.phenotypes: got 'some', expected one of all, default"),
         ({"local_changes": ["nose"]}, {}, r"options.local_changes: got 'nose'.*soma backends show anny"),
-        ({}, {LOCAL[0]: 1.0}, rf"{LOCAL[0]}.*built with 0 local changes.*local_changes: \[{LOCAL[0]}\]"),
-        ({"phenotypes": "default"}, {"asian": 1.0}, r"'asian', but.*six default.*phenotypes: all"),
+        (
+            {},
+            {LOCAL[0]: 1.0},
+            rf"{LOCAL[0]}.*built with 0 local changes.*backend.options.local_changes=\[{LOCAL[0]}\]",
+        ),
+        (
+            {"phenotypes": "default"},
+            {"asian": 1.0},
+            r"'asian', but.*six default.*options.phenotypes=all",
+        ),
     ],
 )
 def test_refused_options_and_parameters(options, params, expected):
