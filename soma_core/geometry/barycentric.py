@@ -39,7 +39,9 @@ def tetrahedral_coordinates(points: np.ndarray, corners: np.ndarray) -> np.ndarr
 
 def _mean_edge(first: np.ndarray, second: np.ndarray) -> np.ndarray:
     third = second - first
-    return (np.linalg.norm(first, axis=1) + np.linalg.norm(second, axis=1) + np.linalg.norm(third, axis=1)) / 3
+    return (
+        np.linalg.norm(first, axis=1) + np.linalg.norm(second, axis=1) + np.linalg.norm(third, axis=1)
+    ) / 3
 
 
 def raised_normal(corners: Tensor) -> Tensor:
@@ -69,7 +71,9 @@ def raised_normal_jacobian(corners: np.ndarray) -> np.ndarray:
     area = np.linalg.norm(normal, axis=1)
     unit = normal / area[:, None]
     directions = [edge / np.linalg.norm(edge, axis=1)[:, None] for edge in (first, second, second - first)]
-    tangent = (np.eye(3) - unit[:, :, None] * unit[:, None, :]) * (_mean_edge(first, second) / area)[:, None, None]
+    tangent = (np.eye(3) - unit[:, :, None] * unit[:, None, :]) * (_mean_edge(first, second) / area)[
+        :, None, None
+    ]
 
     def turn(vectors: np.ndarray) -> np.ndarray:
         """Cross-product matrices of row vectors."""

@@ -60,7 +60,13 @@ def matrix_to_axis_angle(matrix: Tensor) -> Tensor:
     w = torch.stack(
         [
             torch.stack(
-                [1 + trace, m[..., 2, 1] - m[..., 1, 2], m[..., 0, 2] - m[..., 2, 0], m[..., 1, 0] - m[..., 0, 1]], -1
+                [
+                    1 + trace,
+                    m[..., 2, 1] - m[..., 1, 2],
+                    m[..., 0, 2] - m[..., 2, 0],
+                    m[..., 1, 0] - m[..., 0, 1],
+                ],
+                -1,
             ),
             torch.stack(
                 [
@@ -130,5 +136,7 @@ def orthonormality_error(matrix: Tensor) -> Tensor:
     """Largest entry of ``|R^T R - I|`` and of ``|det R - 1|``; (..., 3, 3) -> (...)."""
     eye = torch.eye(3, dtype=matrix.dtype, device=matrix.device)
     gram = (matrix.transpose(-1, -2) @ matrix - eye).abs().amax((-1, -2))
-    determinant = (matrix[..., 0, :] * torch.linalg.cross(matrix[..., 1, :], matrix[..., 2, :], dim=-1)).sum(-1)
+    determinant = (matrix[..., 0, :] * torch.linalg.cross(matrix[..., 1, :], matrix[..., 2, :], dim=-1)).sum(
+        -1
+    )
     return torch.maximum(gram, (determinant - 1).abs())

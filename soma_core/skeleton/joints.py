@@ -65,7 +65,9 @@ def joint_regressor(mesh: CanonicalMesh, rig: Rig) -> scipy.sparse.csr_array:
     Rows sum to one except the root's, which is empty: the root is pinned to the origin. Cached on disk
     by rig revision. Paper, equations 2 to 4, with the weights fixed at the bind shape.
     """
-    key = content_key("joint_regressor", _CODE_VERSION, rig.revision, rig.bind_shape, rig.bind_world, rig.weights.data)
+    key = content_key(
+        "joint_regressor", _CODE_VERSION, rig.revision, rig.bind_shape, rig.bind_world, rig.weights.data
+    )
     arrays = cached_arrays("joint_regressor", key, lambda: _build(mesh, rig))
     return scipy.sparse.csr_array(
         (arrays["data"], arrays["indices"], arrays["indptr"]), shape=(rig.joint_count, mesh.vertex_count)

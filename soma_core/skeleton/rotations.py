@@ -63,7 +63,9 @@ class RotationFit(torch.nn.Module):
         warp: run the Warp twin instead of the torch reference.
     """
 
-    def __init__(self, rig: Rig, *, dtype: torch.dtype, device: torch.device | str, warp: bool = False) -> None:
+    def __init__(
+        self, rig: Rig, *, dtype: torch.dtype, device: torch.device | str, warp: bool = False
+    ) -> None:
         super().__init__()
         self.warp = warp
         plan = alignment_plan(rig)
@@ -73,7 +75,9 @@ class RotationFit(torch.nn.Module):
 
         def keep(name: str, array: np.ndarray) -> None:
             tensor = torch.as_tensor(np.array(array), device=device)
-            self.register_buffer(name, tensor.to(dtype) if tensor.is_floating_point() else tensor, persistent=False)
+            self.register_buffer(
+                name, tensor.to(dtype) if tensor.is_floating_point() else tensor, persistent=False
+            )
 
         keep("pivots", plan.pivots)
         keep("child_table", table)

@@ -75,7 +75,9 @@ class ComposedBasis:
     exact: ExactOffsets | None
 
 
-def compose(linear: LinearBasis, transfer: TopologyTransfer | CanonicalPassThrough, at: Tensor) -> ComposedBasis:
+def compose(
+    linear: LinearBasis, transfer: TopologyTransfer | CanonicalPassThrough, at: Tensor
+) -> ComposedBasis:
     """Fold `transfer` into `linear`.
 
     Args:
@@ -108,7 +110,9 @@ def compose(linear: LinearBasis, transfer: TopologyTransfer | CanonicalPassThrou
     change = (linear.template - default).reshape(-1, 1)
     constant = transfer.affine(linear.template.contiguous()) + raised + slope(change).view(count, 3)
     return ComposedBasis(
-        template=finish(constant).squeeze(1), basis=columns, exact=_exact_offsets(linear, transfer, exact_rows)
+        template=finish(constant).squeeze(1),
+        basis=columns,
+        exact=_exact_offsets(linear, transfer, exact_rows),
     )
 
 

@@ -127,7 +127,9 @@ def _build_region(
 class FillOperator(torch.nn.Module):
     """Applies the fills of all regions to vertices laid out as (v, f): any number of columns."""
 
-    def __init__(self, regions: tuple[RegionFill, ...], *, dtype: torch.dtype, device: torch.device | str) -> None:
+    def __init__(
+        self, regions: tuple[RegionFill, ...], *, dtype: torch.dtype, device: torch.device | str
+    ) -> None:
         super().__init__()
         self.region_count = len(regions)
         for index, region in enumerate(regions):
@@ -144,7 +146,8 @@ class FillOperator(torch.nn.Module):
         """Replace the filled rows of (v, f); the rest passes through."""
         for index in range(self.region_count):
             free, around, ring, fit, lift, harmonic = (
-                getattr(self, f"{name}_{index}") for name in ("free", "around", "ring", "fit", "lift", "harmonic")
+                getattr(self, f"{name}_{index}")
+                for name in ("free", "around", "ring", "fit", "lift", "harmonic")
             )
             filled = lift @ (fit @ flat[around]) + harmonic @ flat[ring]
             flat = flat.index_copy(0, free, filled)

@@ -15,7 +15,9 @@ METRES: dict[Unit, float] = {"m": 1.0, "cm": 0.01, "mm": 0.001}
 
 def _direction(axis: Axis, argument: str) -> np.ndarray:
     if len(axis) != 2 or axis[0] not in "+-" or axis[1] not in "xyz":
-        raise InputError(argument, got=repr(axis), expected="one of +x -x +y -y +z -z", fix="Correct the declaration.")
+        raise InputError(
+            argument, got=repr(axis), expected="one of +x -x +y -y +z -z", fix="Correct the declaration."
+        )
     vector = np.zeros(3)
     vector["xyz".index(axis[1])] = 1.0 if axis[0] == "+" else -1.0
     return vector
@@ -29,6 +31,9 @@ def native_to_canonical(up: Axis, forward: Axis) -> np.ndarray:
     vertical, ahead = _direction(up, "up"), _direction(forward, "forward")
     if abs(vertical @ ahead) > 0:
         raise InputError(
-            "forward", got=repr(forward), expected=f"an axis perpendicular to up={up!r}", fix="Correct the declaration."
+            "forward",
+            got=repr(forward),
+            expected=f"an axis perpendicular to up={up!r}",
+            fix="Correct the declaration.",
         )
     return np.stack([np.cross(vertical, ahead), vertical, ahead])

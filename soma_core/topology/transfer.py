@@ -63,7 +63,9 @@ class TopologyTransfer(torch.nn.Module):
 
         def keep(name: str, array: np.ndarray) -> None:
             tensor = torch.as_tensor(np.ascontiguousarray(array), device=device)
-            self.register_buffer(name, tensor.to(dtype) if tensor.is_floating_point() else tensor, persistent=False)
+            self.register_buffer(
+                name, tensor.to(dtype) if tensor.is_floating_point() else tensor, persistent=False
+            )
 
         keep("corners", correspondence.corners)
         keep("height", correspondence.coordinates[:, 2])

@@ -23,11 +23,17 @@ def read_obj(path: Path) -> tuple[np.ndarray, np.ndarray]:
             head = stream.read(len(_LFS))
     except OSError as error:
         raise AssetError(
-            path, cause=f"cannot be read ({error.strerror})", fix="Reinstall the backend or name another file."
+            path,
+            cause=f"cannot be read ({error.strerror})",
+            fix="Reinstall the backend or name another file.",
         ) from error
     if head == _LFS:
-        raise AssetError(path, cause="is a git-LFS pointer, not the mesh", fix="Run `git lfs pull` where it lies.")
-    mesh = trimesh.load(path, file_type="obj", process=False, maintain_order=True, force="mesh", skip_materials=True)
+        raise AssetError(
+            path, cause="is a git-LFS pointer, not the mesh", fix="Run `git lfs pull` where it lies."
+        )
+    mesh = trimesh.load(
+        path, file_type="obj", process=False, maintain_order=True, force="mesh", skip_materials=True
+    )
     vertices, triangles = np.array(mesh.vertices, np.float64), np.array(mesh.faces, np.int64)
     if not len(vertices) or not len(triangles):
         raise AssetError(path, cause="holds no mesh", fix="Export it again with vertices and faces.")
@@ -72,7 +78,7 @@ def check_wrap(vertices: np.ndarray, triangles: np.ndarray, mesh: CanonicalMesh,
             f"wrap {path}",
             got=f"{strange} of {len(triangles)} faces that do not exist in the canonical mesh",
             expected="the canonical vertex order and faces",
-            fix="Export again with the vertex order kept (Blender: 'Keep Vertex Order'; trimesh: process=False).",
+            fix="Export again with the vertex order kept (Blender: Keep Vertex Order; trimesh: process=False).",
         )
     _refuse_long_edges(vertices, mesh, canonical, path)
 
