@@ -14,16 +14,15 @@ Csr = tuple[Tensor, Tensor, Tensor]
 """Row starts (m + 1,), column ids (e,), values (e,)."""
 
 
-
 class _Gather(torch.autograd.Function):
     """``out = A @ dense`` with constant A; the backward pass applies the transpose, row by row."""
 
     @staticmethod
-    def forward(dense, crow, col, val, t_crow, t_col, t_val):
+    def forward(dense, crow, col, val, _t_crow, _t_col, _t_val):
         return embedding_bag(col, dense, crow, mode="sum", per_sample_weights=val, include_last_offset=True)
 
     @staticmethod
-    def setup_context(ctx, inputs, output) -> None:
+    def setup_context(ctx, inputs, _output) -> None:
         ctx.save_for_backward(*inputs[4:])
 
     @staticmethod
@@ -50,7 +49,9 @@ class SparseRows(torch.nn.Module):
     index order on every device, so results are deterministic.
     """
 
-    def __init__(self, matrix: scipy.sparse.sparray, *, dtype: torch.dtype, device: torch.device | str) -> None:
+    def __init__(
+        self, matrix: scipy.sparse.sparray, *, dtype: torch.dtype, device: torch.device | str
+    ) -> None:
         super().__init__()
         forward, backward = matrix.tocsr(), matrix.T.tocsr()
         self.shape = tuple(forward.shape)
@@ -61,8 +62,20 @@ class SparseRows(torch.nn.Module):
             self._keep(prefix + "val", csr.data, dtype, device)
 
     def _keep(self, name: str, array: np.ndarray, dtype: torch.dtype, device: torch.device | str) -> None:
-        self.register_buffer(name, torch.as_tensor(array.copy()).to(dtype=dtype, device=device), persistent=False)
+        self.register_buffer(
+            name, torch.as_tensor(array.copy()).to(dtype=dtype, device=device), persistent=False
+        )
+
+    @property
+    def csr(self) -> Csr:
+        """Row starts, column ids and values of the matrix."""
+        return self.crow, self.col, self.val
+
+    @property
+    def transpose(self) -> Csr:
+        """Row starts, column ids and values of its transpose."""
+        return self.t_crow, self.t_col, self.t_val
 
     def forward(self, dense: Tensor) -> Tensor:
         """Product with (n, f); (m, f)."""
-        return gather_rows(dense, (self.crow, self.col, self.val), (self.t_crow, self.t_col, self.t_val))
+        return gather_rows(dense, self.csr, self.transpose)

@@ -52,14 +52,23 @@ class SkeletonFit(torch.nn.Module):
     Args:
         mesh, rig: the canonical mesh and rig at one LOD.
         dtype, device: of the constants.
+        warp: fit rotations by the Warp twin instead of the torch reference.
     """
 
-    def __init__(self, mesh: CanonicalMesh, rig: Rig, *, dtype: torch.dtype, device: torch.device | str) -> None:
+    def __init__(
+        self,
+        mesh: CanonicalMesh,
+        rig: Rig,
+        *,
+        dtype: torch.dtype,
+        device: torch.device | str,
+        warp: bool = False,
+    ) -> None:
         super().__init__()
         self.matrix = fit_operator(mesh, rig)
         self.joint_count = rig.joint_count
         self.moments = SparseRows(self.matrix, dtype=dtype, device=device)
-        self.rotations = RotationFit(rig, dtype=dtype, device=device)
+        self.rotations = RotationFit(rig, dtype=dtype, device=device, warp=warp)
 
     def forward(self, vertices: Tensor) -> Tensor:
         """World transforms (B, J, 4, 4) [m] of the joints, from vertices (B, v, 3) [m]. Differentiable."""

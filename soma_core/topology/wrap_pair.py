@@ -78,7 +78,7 @@ def check_wrap(vertices: np.ndarray, triangles: np.ndarray, mesh: CanonicalMesh,
             f"wrap {path}",
             got=f"{strange} of {len(triangles)} faces that do not exist in the canonical mesh",
             expected="the canonical vertex order and faces",
-            fix="Export again with the vertex order kept (Blender: Keep Vertex Order; trimesh: process=False).",
+            fix="Export again, vertex order kept (Blender: Keep Vertex Order; trimesh: process=False).",
         )
     _refuse_long_edges(vertices, mesh, canonical, path)
 
