@@ -36,19 +36,15 @@ def base_mesh(data: Path) -> tuple[np.ndarray, np.ndarray]:
         AssetError: the file does not hold the expected mesh.
     """
     path = data / "mpfb2" / "3dobjs" / "base.obj"
-    vertices: list[list[float]] = []
+    lines = [line.split() for line in path.read_text("utf-8").splitlines()]
+    vertices = [[float(value) for value in fields[1:4]] for fields in lines if fields[:1] == ["v"]]
     used: set[int] = set()
     group = ""
-    with open(path, encoding="utf-8") as stream:
-        for fields in map(str.split, stream):
-            if not fields:
-                continue
-            if fields[0] == "v":
-                vertices.append([float(value) for value in fields[1:4]])
-            elif fields[0] == "g":
-                group = fields[1]
-            elif fields[0] == "f" and group in _VISIBLE_GROUPS:
-                used.update(int(corner.split("/")[0]) - 1 for corner in fields[1:])
+    for fields in lines:
+        if fields[:1] == ["g"]:
+            group = fields[1]
+        if fields[:1] == ["f"] and group in _VISIBLE_GROUPS:
+            used.update(int(corner.split("/")[0]) - 1 for corner in fields[1:])
     if not used or max(used) >= len(vertices):
         raise AssetError(path, cause=f"{len(vertices)} vertices and no usable body faces", fix=_FIX)
     kept = np.array(sorted(used - _REMOVED_VERTICES))
