@@ -116,7 +116,7 @@ class TrainShapeConfig:
 
     mix: dict[str, float] = field(default_factory=dict)
     options: dict[str, Any] = field(default_factory=dict)
-    spread: float = 0.3
+    spread: float = 0.15
     skip_groups: list[str] = field(default_factory=list)
     count: int = 6000
     components: int = 128

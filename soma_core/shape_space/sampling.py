@@ -34,7 +34,7 @@ def sample_parameters(
     count: int,
     random: np.random.Generator,
     *,
-    spread: float = 0.3,
+    spread: float = 0.15,
     skip_groups: Collection[str] = (),
 ) -> dict[str, np.ndarray]:
     """Draw parameters (count, *shape) for a backend from what it declares.
@@ -76,7 +76,7 @@ class IdentityStream:
         mix: Mapping[str, float],
         *,
         seed: int,
-        spread: float = 0.3,
+        spread: float = 0.15,
         skip_groups: Collection[str] = (),
     ) -> None:
         if not mix or not all(np.isfinite(share) and share > 0 for share in mix.values()):
