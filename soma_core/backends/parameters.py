@@ -29,8 +29,8 @@ def batch_parameters(
     and a generator takes a missing one as its default.
 
     Tensors keep their autograd history and must already have `device` and `dtype`. Values are
-    checked to be finite except inside ``torch.compile`` and CUDA graph capture, where the check
-    would synchronise.
+    checked to be finite on the CPU, outside ``torch.compile``: elsewhere the check would make the
+    host wait for the device.
 
     Raises:
         InputError: unknown name, wrong shape, batch sizes that disagree, NaN or infinity, an
@@ -171,10 +171,9 @@ def _batch_size(tensors: Mapping[str, Tensor]) -> int:
 
 
 def _check_finite(tensors: Mapping[str, Tensor]) -> None:
-    """Refuse NaN and infinity with one device synchronisation for all parameters together."""
-    if not tensors or torch.compiler.is_compiling():
-        return
-    if torch.cuda.is_available() and torch.cuda.is_current_stream_capturing():
+    """Refuse NaN and infinity where looking at values costs no synchronisation."""
+    on_host = all(tensor.device.type == "cpu" for tensor in tensors.values())
+    if not tensors or not on_host or torch.compiler.is_compiling():
         return
     # x * 0 is 0 for finite x and NaN otherwise; unlike a plain sum it cannot overflow.
     probe = sum((tensor.detach() * 0).sum() for tensor in tensors.values())
