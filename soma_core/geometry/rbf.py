@@ -17,12 +17,16 @@ def affine_rbf_weights(points: np.ndarray, queries: np.ndarray) -> np.ndarray:
 
     Linear kernel ``|a - b|`` with a first-degree polynomial; the weights of each query sum to one. One
     factorisation serves all queries. Clouds of fewer than four points or of lower rank get the
-    least-squares solution of minimum norm.
+    least-squares solution of minimum norm; coincident points share a weight equally.
 
     Args:
         points: (n, 3) float64, n >= 1.
         queries: (q, 3) float64.
     """
+    distinct, place, copies = np.unique(points, axis=0, return_inverse=True, return_counts=True)
+    if len(distinct) < len(points):
+        place = place.ravel()
+        return affine_rbf_weights(distinct, queries)[:, place] / copies[place]
     centre = points.mean(0)
     scale = np.abs(points - centre).max() or 1.0
     local, targets = (points - centre) / scale, (queries - centre) / scale
