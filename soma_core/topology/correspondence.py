@@ -13,11 +13,11 @@ from soma_core.geometry.barycentric import closest_point_on_triangle, tetrahedra
 from soma_core.plugin.spec import WrapPair
 from soma_core.rig.mesh import CanonicalMesh
 from soma_core.topology.closest import ClosestFaces
-from soma_core.topology.wrap_pair import check_wrap, read_obj
+from soma_core.topology.wrap_pair import check_wrap, read_obj, refuse_unreadable
 
 __all__ = ["Correspondence", "affine_matrix", "build_correspondence", "load_correspondence"]
 
-_CODE_VERSION = "2"
+_CODE_VERSION = "3"
 
 _FAR = 0.02
 """Median distance, relative to the bounding diagonal, above which a pair cannot be meant."""
@@ -136,7 +136,13 @@ def load_correspondence(pair: WrapPair, mesh: CanonicalMesh) -> Correspondence:
     """Correspondence of an OBJ pair with the mid-LOD canonical mesh, from the cache when it was built before.
 
     The cache key covers both files' bytes, the rig revision and this code's version.
+
+    Raises:
+        AssetError: a file is missing or no mesh.
+        InputError: the wrap is not the canonical mesh, or the two files lie apart.
     """
+    for path in (pair.native, pair.wrap):
+        refuse_unreadable(path)
     key = content_key(
         "correspondence", _CODE_VERSION, file_sha256(pair.native), file_sha256(pair.wrap), mesh.revision
     )

@@ -9,15 +9,13 @@ import numpy as np
 from soma_core.errors import AssetError, InputError
 from soma_core.rig.mesh import CanonicalMesh
 
-__all__ = ["check_wrap", "read_obj"]
+__all__ = ["check_wrap", "read_obj", "refuse_unreadable"]
 
 _LFS = b"version https://git-lfs"
 
 
-def read_obj(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices (n, 3) float64 and triangles (t, 3) int64 of an OBJ, in the file's order, nothing merged."""
-    import trimesh
-
+def refuse_unreadable(path: Path) -> None:
+    """Raise AssetError where `path` is missing, closed to us, or a git-LFS pointer."""
     try:
         with open(path, "rb") as stream:
             head = stream.read(len(_LFS))
@@ -31,16 +29,59 @@ def read_obj(path: Path) -> tuple[np.ndarray, np.ndarray]:
         raise AssetError(
             path, cause="is a git-LFS pointer, not the mesh", fix="Run `git lfs pull` where it lies."
         )
-    mesh = trimesh.load(
-        path, file_type="obj", process=False, maintain_order=True, force="mesh", skip_materials=True
-    )
-    vertices, triangles = np.array(mesh.vertices, np.float64), np.array(mesh.faces, np.int64)
-    if not len(vertices) or not len(triangles):
+
+
+def read_obj(path: Path) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices (n, 3) float64 and triangles (t, 3) int64 of an OBJ, in the file's order.
+
+    Only ``v`` and ``f`` lines are read, so texture seams, normals, groups and materials neither split nor
+    reorder vertices, as they do in mesh libraries. Polygons become fans.
+
+    Raises:
+        AssetError: missing, a git-LFS pointer, not an OBJ mesh, or not finite.
+    """
+    refuse_unreadable(path)
+    text = path.read_text(encoding="utf-8", errors="replace").replace("\\\n", " ")
+    points: list[list[float]] = []
+    faces: list[tuple[int, int, int]] = []
+    for number, line in enumerate(text.splitlines(), 1):
+        kind, *fields = line.split() or [""]
+        try:
+            if kind == "v":
+                points.append(_point(fields))
+            elif kind == "f":
+                faces += _fan(fields, len(points))
+        except ValueError as error:
+            raise AssetError(
+                path, cause=f"line {number} is {line:.60}", fix="Export the mesh again."
+            ) from error
+    if not points or not faces:
         raise AssetError(path, cause="holds no mesh", fix="Export it again with vertices and faces.")
+    vertices, triangles = np.array(points, np.float64), np.array(faces, np.int64)
+    if triangles.min() < 0 or triangles.max() >= len(vertices):
+        strange = triangles.max() if triangles.max() >= len(vertices) else triangles.min()
+        cause = f"a face refers to vertex {strange + 1} of {len(vertices)}"
+        raise AssetError(path, cause=cause, fix="Export the mesh again.")
     if not np.isfinite(vertices).all():
         bad = int(np.flatnonzero(~np.isfinite(vertices).all(1))[0])
         raise AssetError(path, cause=f"vertex {bad} is not finite", fix="Export the mesh again.")
     return vertices, triangles
+
+
+def _point(fields: list[str]) -> list[float]:
+    """Coordinates of a ``v`` line; vertex colours that may follow are left out."""
+    if len(fields) < 3:
+        raise ValueError(fields)
+    return [float(field) for field in fields[:3]]
+
+
+def _fan(fields: list[str], count: int) -> list[tuple[int, int, int]]:
+    """Triangles of an ``f`` line; indices count from 1, or backwards from the last of `count` vertices."""
+    if len(fields) < 3:
+        raise ValueError(fields)
+    numbers = [int(field.partition("/")[0]) for field in fields]
+    ids = [number - 1 if number > 0 else number + count for number in numbers]
+    return [(ids[0], ids[i], ids[i + 1]) for i in range(1, len(ids) - 1)]
 
 
 def _canonical_edges(mesh: CanonicalMesh) -> np.ndarray:
