@@ -81,9 +81,11 @@ class SomaLayer(torch.nn.Module):
     def _build(self, device: torch.device, dtype: torch.dtype) -> None:
         self.device, self.dtype = device, dtype
         generator = self._registry.generator(self.backend, device=device, dtype=dtype, options=self.options)
+        wrap_mesh = self.mesh if self.mesh.lod == "mid" else load_canonical("mid")[0]
         self.rest_shape = make_rest_shape(
-            self.spec, generator, self.mesh, self.rig, device=device, dtype=dtype, exact=self.exact
-        )
+            self.spec, generator, self.mesh, self.rig, device=device, dtype=dtype, exact=self.exact,
+            warp=self.kernels != "torch", wrap_mesh=wrap_mesh,
+        )  # fmt: skip
         self.animation = Animation(self.rig, device=device, dtype=dtype, kernels=self.kernels)
 
     def _apply(self, fn, recurse=True):

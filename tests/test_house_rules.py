@@ -24,13 +24,14 @@ TREE_MIB = 24
 
 # A package imports from lower ranks and its own, never from higher ones.
 RANKS = [
-    {"errors", "paths", "cache"},
+    {"errors", "paths", "cache", "progress"},
     {"geometry", "plugin"},
     {"kernels", "_inputs"},
     {"rig", "topology", "skeleton", "animation", "correctives", "inversion"},
     {"backends", "io"},
     {"layer"},
     {"config", "shape_space", "testing"},
+    {"evaluation"},
     {"tasks"},
     {"cli"},
 ]

@@ -31,8 +31,9 @@ class Animation(torch.nn.Module):
         self, rig: Rig, *, dtype: torch.dtype, device: torch.device, kernels: Literal["auto", "torch", "warp"]
     ) -> None:
         super().__init__()
-        self.kernels = kernels
-        self.kinematics = Kinematics(rig, dtype=dtype, device=device)
+        # Measured (benchmarks/README.md): on CPU Warp wins the tree walk and torch the sparse blend.
+        self.warp_skinning = kernels == "warp" or (kernels == "auto" and device.type == "cuda")
+        self.kinematics = Kinematics(rig, dtype=dtype, device=device, warp=kernels != "torch")
         self.skinning = Skinning(rig.weights, dtype=dtype, device=device)
 
     def repose(self, vertices: Tensor, fitted: Tensor) -> tuple[Tensor, Tensor]:
@@ -49,7 +50,11 @@ class Animation(torch.nn.Module):
         offsets = self.kinematics.local_offsets(fitted)
         rotations, positions = self.kinematics(relative, offsets, fitted[:, 1, :3, 3])
         transforms = skinning_transforms(rotations, positions, fitted)
-        return self.skinning(vertices, transforms), to_homogeneous(rotations, positions)
+        if self.warp_skinning:
+            skinned = self._skin(vertices.permute(2, 0, 1), transforms).permute(1, 2, 0)
+        else:
+            skinned = self.skinning(vertices, transforms)
+        return skinned, to_homogeneous(rotations, positions)
 
     def pose(self, identity: Identity, relative: Tensor, translation: Tensor, *, absolute: bool) -> Posed:
         """Posed bodies; `relative` (B, J - 1, 3, 3) and `translation` (B, 3) [m] are already checked."""
@@ -68,6 +73,11 @@ class Animation(torch.nn.Module):
     def _skin(self, rest: Tensor, transforms: Tensor) -> Tensor:
         """Posed vertices (B, v, 3), contiguous."""
         batch, count = len(transforms), rest.shape[1]
+        if self.warp_skinning:
+            from soma_core.kernels.skinning_wp import skin
+
+            weights = self.skinning.weights
+            return skin(rest.expand(batch, count, 3).contiguous(), transforms, weights.csr, weights.transpose)
         if len(rest) == 1 and not rest.requires_grad:
             parts = [
                 self.skinning.shared(rest[0], transforms[start : start + _POSES])

@@ -47,44 +47,50 @@ class Kinematics(torch.nn.Module):
 
     Rotations are T-pose-relative: in axes aligned with the world at T-pose, identity is the T-pose, and
     the joint orient cancels down the chain: ``W_j = (R_1 ... R_j) O_j``.
+
+    Args:
+        rig: joint tree, bind pose and T-pose.
+        warp: run the Warp twin instead of the torch reference.
     """
 
-    def __init__(self, rig: Rig, *, dtype: torch.dtype, device: torch.device | str) -> None:
+    def __init__(self, rig: Rig, *, dtype: torch.dtype, device: torch.device | str, warp: bool = False) -> None:
         super().__init__()
-        self.joint_count = rig.joint_count
+        self.warp, self.joint_count = warp, rig.joint_count
         parents = np.maximum(rig.parents, 0)
         orient = rig.t_pose_world[:, :3, :3].copy()
         orient[0] = np.eye(3)
         bind = rig.bind_world[:, :3, :3]
         bind_local = np.einsum("jba,jbc->jac", bind[parents], bind)
         bind_relative = np.einsum("jab,jbc,jdc->jad", orient[parents], bind_local, orient)
-
-        def keep(name: str, array: np.ndarray) -> None:
-            tensor = torch.as_tensor(np.ascontiguousarray(array), device=device)
-            self.register_buffer(name, tensor.to(dtype) if tensor.is_floating_point() else tensor, persistent=False)
-
-        keep("parents", parents[1:])
-        keep("orient", orient)
-        keep("parent_orient", orient[parents])
-        keep("bind_relative", bind_relative[1:])
         levels = joint_levels(rig.parents)
         order = np.concatenate([[0], *levels])
         where = np.argsort(order)
         self.level_sizes = [len(level) for level in levels]
-        for index, level in enumerate(levels):
-            before = np.concatenate([[0], *levels])[: 1 + sum(self.level_sizes[:index])]
-            start = len(before) - (1 if index == 0 else self.level_sizes[index - 1])
-            keep(f"level_{index}", level)
-            keep(f"level_parent_{index}", where[parents[level]] - start)
+
+        def keep(name: str, array: np.ndarray) -> None:
+            tensor = torch.as_tensor(np.array(array), device=device)
+            tensor = tensor.to(dtype if tensor.is_floating_point() else torch.int64)
+            self.register_buffer(name, tensor, persistent=False)
+
+        keep("parents", parents[1:])
+        keep("tree", rig.parents)
+        keep("order", order)
         keep("restore", where)
+        keep("orient", orient)
+        keep("parent_orient", orient[parents])
+        keep("bind_relative", bind_relative[1:])
+        first = 0  # rank, in level order, of the first joint on the level above
+        for index, level in enumerate(levels):
+            keep(f"level_{index}", level)
+            keep(f"level_parent_{index}", where[parents[level]] - first)
+            first += 1 if index == 0 else self.level_sizes[index - 1]
 
     def local_offsets(self, bind_world: Tensor) -> Tensor:
         """Bone vectors in parent-joint axes, turned to T-pose world axes; (B, J, 4, 4) -> (B, J, 3) [m]."""
         positions, rotations = bind_world[..., :3, 3], bind_world[..., :3, :3]
         step = positions[:, 1:] - positions[:, self.parents]
-        local = rotations[:, self.parents].transpose(-1, -2) @ step[..., None]
-        turned = (self.parent_orient[1:] @ local).squeeze(-1)
-        return torch.cat((positions[:, :1], turned), 1)
+        turn = self.parent_orient[1:] @ rotations[:, self.parents].transpose(-1, -2)
+        return torch.cat((positions[:, :1], (turn @ step[..., None]).squeeze(-1)), 1)
 
     def forward(self, relative: Tensor, offsets: Tensor, translation: Tensor) -> tuple[Tensor, Tensor]:
         """World rotations (B, J, 3, 3) and positions (B, J, 3) [m].
@@ -96,13 +102,23 @@ class Kinematics(torch.nn.Module):
         """
         batch = len(relative)
         eye = torch.eye(3, dtype=relative.dtype, device=relative.device).expand(batch, 1, 3, 3)
-        offsets = torch.cat((offsets[:, :1].expand(batch, 1, 3), translation[:, None],
-                             offsets[:, 2:].expand(batch, -1, 3)), 1)  # fmt: skip
-        turns, places = [eye], [offsets.new_zeros(batch, 1, 3)]
+        root, limbs = torch.zeros_like(translation)[:, None], offsets[:, 2:].expand(batch, -1, 3)
+        turns = torch.cat((eye, relative), 1)
+        offsets = torch.cat((root, translation[:, None], limbs), 1)
+        if self.warp:
+            from soma_core.kernels.kinematics_wp import forward_kinematics
+
+            turns, positions = forward_kinematics(turns, offsets, self.order, self.tree)
+        else:
+            turns, positions = self._walk(turns, offsets)
+        return turns @ self.orient, positions
+
+    def _walk(self, relative: Tensor, offsets: Tensor) -> tuple[Tensor, Tensor]:
+        """Accumulate turns and positions level by level from the root."""
+        turns, places = [relative[:, :1]], [offsets[:, :1]]
         for index in range(len(self.level_sizes)):
             level, parent = getattr(self, f"level_{index}"), getattr(self, f"level_parent_{index}")
             above = turns[-1][:, parent]
             places.append(places[-1][:, parent] + (above @ offsets[:, level, :, None]).squeeze(-1))
-            turns.append(above @ relative[:, level - 1])
-        rotations = torch.cat(turns, 1)[:, self.restore] @ self.orient
-        return rotations, torch.cat(places, 1)[:, self.restore]
+            turns.append(above @ relative[:, level])
+        return torch.cat(turns, 1)[:, self.restore], torch.cat(places, 1)[:, self.restore]

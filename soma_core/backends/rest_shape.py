@@ -94,10 +94,16 @@ def make_rest_shape(
     dtype: torch.dtype,
     device: torch.device,
     exact: bool,
+    warp: bool,
+    wrap_mesh: CanonicalMesh,
 ) -> ExactRestShape | ComposedRestShape:
-    """The rest-shape module of a backend: composed when it is linear, unless `exact` asks otherwise."""
-    fit = SkeletonFit(mesh, rig, dtype=dtype, device=device)
-    correspondence = None if spec.wrap is None else load_correspondence(spec.wrap, mesh)
+    """The rest-shape module of a backend: composed when it is linear, unless `exact` asks otherwise.
+
+    `warp` chooses the Warp twin for the skeleton's rotations. `wrap_mesh` is the mid LOD, which wrap
+    pairs are made for.
+    """
+    fit = SkeletonFit(mesh, rig, dtype=dtype, device=device, warp=warp)
+    correspondence = None if spec.wrap is None else load_correspondence(spec.wrap, wrap_mesh)
     transfer = make_transfer(spec, mesh, correspondence, dtype=dtype, device=device)
     if exact or not isinstance(generator, HasLinearBasis):
         return ExactRestShape(generator, transfer, fit)

@@ -82,7 +82,15 @@ def _rotation_functions(scalar: str, module: wp.Module) -> SimpleNamespace:
         eye = wp.identity(n=3, dtype=real)
         return (real(2.0) * wp.outer(middle, middle) - eye) * (real(2.0) * wp.outer(a, a) - eye)
 
-    return SimpleNamespace(vec3=vec3, mat33=mat33, from_covariance=from_covariance, arc=arc)
+    @wp.func(module=module)
+    def pair_normal(first: vec3, second: vec3, first_goal: vec3, second_goal: vec3):
+        source, goal = wp.cross(first, second), wp.cross(first_goal, second_goal)
+        area = wp.sqrt(wp.sqrt((wp.dot(source, source) + tiny) * (wp.dot(goal, goal) + tiny)))
+        return wp.outer(goal, source) / area
+
+    return SimpleNamespace(
+        vec3=vec3, mat33=mat33, from_covariance=from_covariance, arc=arc, pair_normal=pair_normal
+    )
 
 
 @functools.cache
@@ -90,7 +98,7 @@ def _kernels(scalar: str, width: int) -> SimpleNamespace:
     module = wp.get_module(f"soma_skeleton_fit_{scalar}_{width}")
     functions = _rotation_functions(scalar, module)
     vec3, mat33 = functions.vec3, functions.mat33
-    from_covariance, arc = functions.from_covariance, functions.arc
+    from_covariance, arc, pair_normal = functions.from_covariance, functions.arc, functions.pair_normal
 
     @wp.kernel(module=module)
     def displace(
@@ -106,9 +114,15 @@ def _kernels(scalar: str, width: int) -> SimpleNamespace:
         else:
             total = mat33()
             for e in range(width):  # unrolled: Warp differentiates a dynamic loop over sums wrongly
-                d = wp.int32(children[p, e])
-                if d >= 0:
-                    total += wp.outer(joints[b, d] - joints[b, k], first * (bind[d] - bind[k]))
+                c0 = wp.int32(children[p, e])
+                if c0 >= 0:
+                    bone, reach = first * (bind[c0] - bind[k]), joints[b, c0] - joints[b, k]
+                    total += wp.outer(reach, bone)
+                    for f in range(width):
+                        c1 = wp.int32(children[p, f])
+                        if f > e and c1 >= 0:
+                            other, far = first * (bind[c1] - bind[k]), joints[b, c1] - joints[b, k]
+                            total += pair_normal(bone, other, reach, far)
             out[b, p] = from_covariance(total) * first
 
     return SimpleNamespace(vec3=vec3, mat33=mat33, displace=displace)

@@ -86,6 +86,14 @@ class RotationFit(torch.nn.Module):
         keep("several", several)
         keep("fan_slot", slot)
         keep("fan_child", table[several[slot], column])
+        pairs = [
+            (rank, i, j)
+            for rank in range(len(several))
+            for i in np.flatnonzero(slot == rank)
+            for j in np.flatnonzero(slot == rank)
+            if i < j
+        ]
+        keep("pair", np.array(pairs, np.int64).reshape(-1, 3).T)
         keep("order", np.argsort(np.concatenate([single, several])))
         keep("source", plan.source + 1)
         keep("bind", bind)
@@ -100,7 +108,8 @@ class RotationFit(torch.nn.Module):
         else:
             displacement = self._displacements(joints, covariances)
         eye = torch.eye(3, dtype=joints.dtype, device=joints.device).expand(len(joints), 1, 3, 3)
-        return torch.cat((eye, displacement), 1)[:, self.source] @ self.bind_rotation
+        world = torch.cat((eye, displacement), 1)[:, self.source] @ self.bind_rotation
+        return 1.5 * world - 0.5 * world @ (world.transpose(-1, -2) @ world)  # undo the products' rounding
 
     def _displacements(self, joints: Tensor, covariances: Tensor) -> Tensor:
         initial = rotation_from_covariance(covariances[:, self.pivots])
@@ -109,8 +118,17 @@ class RotationFit(torch.nn.Module):
         first, target = self._bones(joints, initial, self.several[self.fan_slot], self.fan_child)
         outer = target[..., :, None] * first[..., None, :]
         sums = outer.new_zeros(len(joints), len(self.several), 3, 3).index_add(1, self.fan_slot, outer)
+        sums = sums.index_add(1, self.pair[0], self._pair_normals(first, target))
         spread = rotation_from_covariance(sums) @ initial[:, self.several]
         return torch.cat((aligned, spread), 1)[:, self.order]
+
+    def _pair_normals(self, first: Tensor, target: Tensor) -> Tensor:
+        """Covariance of the normals of each pair of bones, scaled to length by the area they span."""
+        (i, j), tiny = self.pair[1:], torch.finfo(first.dtype).tiny ** 0.5
+        source = torch.linalg.cross(first[:, i], first[:, j], dim=-1)
+        goal = torch.linalg.cross(target[:, i], target[:, j], dim=-1)
+        area = (((source * source).sum(-1) + tiny) * ((goal * goal).sum(-1) + tiny)) ** -0.25
+        return area[..., None, None] * goal[..., :, None] * source[..., None, :]
 
     def _bones(self, joints: Tensor, initial: Tensor, rank: Tensor, child: Tensor) -> tuple[Tensor, Tensor]:
         """Bind bones turned by stage a, and fitted bones, from the pivots at `rank` to `child`."""
@@ -124,7 +142,10 @@ def fit_rotations(rig: Rig, joints: Tensor, covariances: Tensor) -> Tensor:
 
     Stage a: ``R_init`` is the rotation nearest to the covariance ``sum (x - j)(a - j_bind)^T`` of the
     joint's vertices. Stage b: one child, the shortest arc from the turned bind bone to the fitted one;
-    several children, the rotation nearest to their covariance; none, the displacement of the parent.
+    several children, the rotation nearest to the covariance of their bones and of the normals of each
+    pair of bones; none, the displacement of the parent.
+    A fan of children is nearly flat (hips, chest, hand): its bones alone leave the tilt of that plane
+    to their smallest deviations. The pairs' normals hold it, whatever the order of the children.
     The world rotation is ``R_align R_init R_bind``. Differentiable; every joint independent of the
     others, so a posed body is fitted as well as a body at rest.
     """

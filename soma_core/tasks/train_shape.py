@@ -19,13 +19,13 @@ from soma_core.errors import InputError
 from soma_core.layer import SomaLayer
 from soma_core.paths import cache_dir
 from soma_core.plugin.registry import default_registry
+from soma_core.progress import progress
 from soma_core.rig import load_canonical
 from soma_core.rig.mesh import CanonicalMesh
 from soma_core.rig.neutral import ShapeSpace
 from soma_core.shape_space.report import ErrorRow, plot_errors, reconstruction_errors
 from soma_core.shape_space.sampling import HELD_OUT, IdentityStream
 from soma_core.shape_space.training import Components, TrainingPlan, train_components
-from soma_core.tasks.progress import progress
 
 __all__ = ["SHAPE_SPACE_FILE", "run", "write_shape_space"]
 

@@ -3,7 +3,7 @@
 import io
 import logging
 
-from soma_core.tasks.progress import progress
+from soma_core.progress import progress
 
 
 def test_plain_lines_count_every_step(caplog, monkeypatch):

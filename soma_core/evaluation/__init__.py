@@ -1,0 +1,3 @@
+"""Experiments: one module for each claim that ``soma evaluate experiment=<name>`` measures."""
+
+__all__: list[str] = []

@@ -1,0 +1,83 @@
+"""What an experiment found: figures, the bounds they are held to, and a table for people."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+__all__ = ["Figure", "Report", "distance_figures"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Figure:
+    """One measured number.
+
+    Attributes:
+        name: what was measured.
+        value: the number.
+        unit: its unit.
+        bound: largest value that passes; None for a figure that only informs.
+    """
+
+    name: str
+    value: float
+    unit: str = ""
+    bound: float | None = None
+
+    @property
+    def passed(self) -> bool:
+        """Whether the figure is inside its bound."""
+        return self.bound is None or bool(np.isfinite(self.value) and self.value <= self.bound)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Report:
+    """All figures of one experiment.
+
+    Attributes:
+        title: one line.
+        figures: in the order a reader wants them.
+        notes: sentences that explain the figures.
+    """
+
+    title: str
+    figures: Sequence[Figure]
+    notes: Sequence[str] = field(default_factory=tuple)
+
+    @property
+    def failed(self) -> list[Figure]:
+        """Figures outside their bound."""
+        return [figure for figure in self.figures if not figure.passed]
+
+    def as_json(self) -> dict[str, Any]:
+        """Plain values for ``report.json``."""
+        rows = [
+            {"name": f.name, "value": float(f.value), "unit": f.unit, "bound": f.bound, "passed": f.passed}
+            for f in self.figures
+        ]
+        return {"title": self.title, "figures": rows, "notes": list(self.notes)}
+
+    def as_markdown(self) -> str:
+        """A table, bounds beside figures."""
+        lines = [f"# {self.title}", "", "| figure | value | bound | |", "|---|---|---|---|"]
+        for figure in self.figures:
+            bound = "" if figure.bound is None else f"<= {figure.bound:g} {figure.unit}"
+            mark = "" if figure.bound is None else ("ok" if figure.passed else "FAILED")
+            lines.append(f"| {figure.name} | {figure.value:.4g} {figure.unit} | {bound} | {mark} |")
+        return "\n".join([*lines, "", *self.notes, ""])
+
+
+def distance_figures(
+    name: str, metres: np.ndarray, *, mean: float | None = None, p95: float | None = None
+) -> list[Figure]:
+    """Mean, standard deviation, P95 and maximum of distances [m], in millimetres."""
+    mm = 1e3 * np.asarray(metres, np.float64).ravel()
+    return [
+        Figure(name=f"{name}, mean", value=float(mm.mean()), unit="mm", bound=mean),
+        Figure(name=f"{name}, std", value=float(mm.std()), unit="mm"),
+        Figure(name=f"{name}, P95", value=float(np.percentile(mm, 95)), unit="mm", bound=p95),
+        Figure(name=f"{name}, max", value=float(mm.max()), unit="mm"),
+    ]

@@ -1,0 +1,45 @@
+"""``soma evaluate``: measure a claim, write the table, and fail when a figure is outside its bound."""
+
+from __future__ import annotations
+
+import importlib
+import json
+import logging
+from pathlib import Path
+
+from omegaconf import DictConfig
+
+from soma_core.cache import atomic_write
+from soma_core.errors import InputError, SomaError
+from soma_core.evaluation.report import Report
+
+__all__ = ["EXPERIMENTS", "run"]
+
+_log = logging.getLogger(__name__)
+
+EXPERIMENTS = ("table1_topology", "forward_path", "anny_reference")
+"""Modules of ``soma_core.evaluation`` with a function ``run(config) -> Report``."""
+
+
+def run(config: DictConfig, output: Path) -> None:
+    """Run `config.experiment.name`; write ``report.json`` and ``report.md`` into `output`.
+
+    Raises:
+        InputError: no such experiment.
+        SomaError: a figure is outside its bound; the reports are written first.
+    """
+    name = config.experiment.name
+    if name not in EXPERIMENTS:
+        raise InputError(
+            "experiment.name", got=repr(name), expected="one of " + ", ".join(EXPERIMENTS), fix="Correct the name."
+        )
+    report: Report = importlib.import_module(f"soma_core.evaluation.{name}").run(config)
+    text = report.as_markdown()
+    for line in text.splitlines():
+        _log.info("%s", line)
+    document = json.dumps(report.as_json(), indent=2) + "\n"
+    atomic_write(output / "report.json", lambda path: path.write_text(document, encoding="utf-8") and None)
+    atomic_write(output / "report.md", lambda path: path.write_text(text, encoding="utf-8") and None)
+    if report.failed:
+        worst = "; ".join(f"{f.name} is {f.value:.4g} {f.unit}, bound {f.bound:g}" for f in report.failed)
+        raise SomaError(f"{name}: {worst}. See {output / 'report.md'}")
