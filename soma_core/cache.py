@@ -60,7 +60,8 @@ def atomic_write(path: Path, write: Callable[[Path], None]) -> None:
 
 def _read(path: Path) -> dict[str, np.ndarray] | None:
     try:
-        with np.load(path, allow_pickle=False) as file:
+        # NumPy leaves a damaged archive open, so the file is opened here.
+        with open(path, "rb") as stream, np.load(stream, allow_pickle=False) as file:
             return {name: file[name] for name in file.files}
     except FileNotFoundError:
         return None

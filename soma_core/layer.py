@@ -112,12 +112,12 @@ class SomaLayer(torch.nn.Module):
             An immutable identity [m]; paper, sections 3.2 to 3.4. Differentiable in every parameter.
         """
         batch = batch_parameters(self.spec, params, device=self.device, dtype=self.dtype)
-        vertices, fitted = self.rest_shape(batch)
-        rest, bind = self.animation.repose(vertices, fitted) if self.repose else (vertices, fitted)
+        points, fitted = self.rest_shape(batch)
+        rest, bind = self.animation.repose(points, fitted) if self.repose else (points, fitted)
         return Identity(
-            rest=rest.permute(2, 0, 1),
+            rest=rest.permute(2, 1, 0),
             bind_world=bind,
-            fitted_rest=vertices.permute(2, 0, 1),
+            fitted_rest=points.permute(2, 1, 0),
             fitted_world=fitted,
             backend=self.backend,
             rig_revision=self.rig.revision,

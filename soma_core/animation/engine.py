@@ -15,10 +15,6 @@ from soma_core.skeleton.identity import Identity
 
 __all__ = ["Animation"]
 
-_POSES = 128
-"""Poses skinned at a time when one body is shared; bounds memory at a few tens of megabytes."""
-
-
 class Animation(torch.nn.Module):
     """Forward kinematics and skinning of one rig at one LOD.
 
@@ -36,24 +32,24 @@ class Animation(torch.nn.Module):
         self.kinematics = Kinematics(rig, dtype=dtype, device=device, warp=kernels != "torch")
         self.skinning = Skinning(rig.weights, dtype=dtype, device=device)
 
-    def repose(self, vertices: Tensor, fitted: Tensor) -> tuple[Tensor, Tensor]:
+    def repose(self, points: Tensor, fitted: Tensor) -> tuple[Tensor, Tensor]:
         """Bring fitted bodies to the rig's bind pose.
 
         Args:
-            vertices: (v, 3, B) [m].
+            points: vertices as planes (3, v, B) [m].
             fitted: (B, J, 4, 4) transforms fitted to them [m].
 
         Returns:
-            Vertices (v, 3, B) and world transforms (B, J, 4, 4) in the bind pose; the Hips stay in place.
+            Planes (3, v, B) and world transforms (B, J, 4, 4) in the bind pose; the Hips stay in place.
         """
-        relative = self.kinematics.bind_relative.expand(len(fitted), -1, 3, 3)
-        offsets = self.kinematics.local_offsets(fitted)
-        rotations, positions = self.kinematics(relative, offsets, fitted[:, 1, :3, 3])
+        kinematics = self.kinematics
+        positions = kinematics.bind_positions(kinematics.local_offsets(fitted), fitted[:, 1, :3, 3])
+        rotations = kinematics.bind_rotation.expand(len(fitted), -1, 3, 3)
         transforms = skinning_transforms(rotations, positions, fitted)
         if self.warp_skinning:
-            skinned = self._skin(vertices.permute(2, 0, 1), transforms).permute(1, 2, 0)
+            skinned = self._skin_warp(points.permute(2, 1, 0), transforms).permute(2, 1, 0)
         else:
-            skinned = self.skinning(vertices, transforms)
+            skinned = self.skinning(points, transforms, rows=False)
         return skinned, to_homogeneous(rotations, positions)
 
     def pose(self, identity: Identity, relative: Tensor, translation: Tensor, *, absolute: bool) -> Posed:
@@ -71,20 +67,15 @@ class Animation(torch.nn.Module):
         )
 
     def _skin(self, rest: Tensor, transforms: Tensor) -> Tensor:
-        """Posed vertices (B, v, 3), contiguous."""
-        batch, count = len(transforms), rest.shape[1]
+        """Posed vertices (B, v, 3), contiguous, from rest vertices (B or 1, v, 3)."""
         if self.warp_skinning:
-            from soma_core.kernels.skinning_wp import skin
-
-            weights = self.skinning.weights
-            return skin(rest.expand(batch, count, 3).contiguous(), transforms, weights.csr, weights.transpose)
+            return self._skin_warp(rest, transforms)
         if len(rest) == 1 and not rest.requires_grad:
-            parts = [
-                self.skinning.shared(rest[0], transforms[start : start + _POSES])
-                for start in range(0, batch, _POSES)
-            ]
-        else:
-            parts = [self.skinning(rest.permute(1, 2, 0), transforms)]
-        rows = [part.reshape(count * 3, -1).t() for part in parts]
-        flat = rows[0].contiguous() if len(rows) == 1 else torch.cat(rows)
-        return flat.view(batch, count, 3)
+            return self.skinning.shared(rest[0], transforms)
+        return self.skinning(rest.permute(2, 1, 0), transforms, rows=True)
+
+    def _skin_warp(self, rest: Tensor, transforms: Tensor) -> Tensor:
+        from soma_core.kernels.skinning_wp import skin
+
+        points = rest.expand(len(transforms), -1, 3).contiguous()
+        return skin(points, transforms, self.skinning.weights.csr, self.skinning.weights.transpose)

@@ -42,6 +42,15 @@ def to_homogeneous(rotations: Tensor, positions: Tensor) -> Tensor:
     return torch.cat((top, bottom), -2)
 
 
+def _ancestors(parents: np.ndarray) -> np.ndarray:
+    """(J, J) matrix that sums a quantity from the root down to each joint."""
+    matrix = np.zeros((len(parents), len(parents)))
+    for joint in np.concatenate([[0], *joint_levels(parents)]):
+        matrix[joint] = matrix[parents[joint]] if parents[joint] >= 0 else 0
+        matrix[joint, joint] = 1
+    return matrix
+
+
 class Kinematics(torch.nn.Module):
     """The rig's joint tree with constant orientations.
 
@@ -79,6 +88,10 @@ class Kinematics(torch.nn.Module):
         keep("orient", orient)
         keep("parent_orient", orient[parents])
         keep("bind_relative", bind_relative[1:])
+        bind_turn = bind @ orient.transpose(0, 2, 1)  # accumulated turns of the bind pose
+        keep("bind_rotation", bind)
+        keep("bind_parent_turn", bind_turn[parents])
+        keep("ancestors", _ancestors(rig.parents))
         first = 0  # rank, in level order, of the first joint on the level above
         for index, level in enumerate(levels):
             keep(f"level_{index}", level)
@@ -112,6 +125,17 @@ class Kinematics(torch.nn.Module):
         else:
             turns, positions = self._walk(turns, offsets)
         return turns @ self.orient, positions
+
+    def bind_positions(self, offsets: Tensor, hips: Tensor) -> Tensor:
+        """Joint positions (B, J, 3) [m] in the bind pose: the turns are constants, so a sum down the tree.
+
+        Args:
+            offsets: (B, J, 3) from :meth:`local_offsets`.
+            hips: (B, 3) Hips position [m].
+        """
+        root = torch.zeros_like(hips)[:, None]
+        steps = torch.cat((root, hips[:, None], offsets[:, 2:]), 1)
+        return self.ancestors @ (self.bind_parent_turn @ steps[..., None]).squeeze(-1)
 
     def _walk(self, relative: Tensor, offsets: Tensor) -> tuple[Tensor, Tensor]:
         """Accumulate turns and positions level by level from the root."""

@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 import scipy.sparse
 import torch
 from torch import Tensor
 
-from soma_core.geometry.sparse import SparseRows, gather_rows
+from soma_core.geometry.sparse import SparseRows, gather_rows, sparse_product
 
 __all__ = ["Skinning", "skinning_transforms"]
 
 _CHUNK = 32
-"""Poses blended at a time: keeps the blended matrices in cache and every buffer below malloc's mmap limit."""
+"""Poses blended at a time: keeps blended matrices in cache and buffers below malloc's mmap limit."""
 
 
 def skinning_transforms(rotations: Tensor, positions: Tensor, bind_world: Tensor) -> Tensor:
@@ -23,10 +25,73 @@ def skinning_transforms(rotations: Tensor, positions: Tensor, bind_world: Tensor
     return torch.cat((turn, shift[..., None]), -1)
 
 
+def _chunks(batch: int) -> Iterator[slice]:
+    return (slice(start, min(start + _CHUNK, batch)) for start in range(0, batch, _CHUNK))
+
+
+def _part(points: Tensor, chunk: slice) -> Tensor:
+    """Columns of (3, v, B) for a chunk of poses; (3, v, 1) serves every chunk."""
+    return points if points.shape[2] == 1 else points[:, :, chunk]
+
+
+class _Blend(torch.autograd.Function):
+    """Blend, apply and lay out, one chunk of poses at a time, with a backward pass that keeps nothing.
+
+    Only inputs are saved: blending again costs less than reading blended matrices back from memory.
+    """
+
+    @staticmethod
+    def forward(points, planes, rows, crow, col, val, t_crow, t_col, t_val):
+        weights, count, batch = (crow, col, val), len(crow) - 1, planes.shape[3]
+        out = planes.new_empty((batch, count, 3) if rows else (3, count, batch))
+        for chunk in _chunks(batch):
+            local, plane = _part(points, chunk), planes[..., chunk].contiguous()
+            width = plane.shape[3]
+            target = planes.new_empty(count, 3, width).transpose(0, 1) if rows else out[:, :, chunk]
+            for row in range(3):
+                total = sparse_product(weights, plane[row, 3])
+                total.addcmul_(sparse_product(weights, plane[row, 0]), local[0])
+                total.addcmul_(sparse_product(weights, plane[row, 1]), local[1])
+                target[row] = total.addcmul_(sparse_product(weights, plane[row, 2]), local[2])
+            if rows:
+                out[chunk] = target.permute(2, 1, 0)
+        return out
+
+    @staticmethod
+    def setup_context(ctx, inputs, output) -> None:
+        points, planes, rows, *matrix = inputs
+        ctx.rows = rows
+        ctx.save_for_backward(points, planes, *matrix)
+
+    @staticmethod
+    def backward(ctx, grad):
+        points, planes, crow, col, val, t_crow, t_col, t_val = ctx.saved_tensors
+        weights, transpose = (crow, col, val), (t_crow, t_col, t_val)
+        points_grad = torch.zeros_like(points, memory_format=torch.contiguous_format)
+        planes_grad = torch.empty_like(planes, memory_format=torch.contiguous_format)
+        for chunk in _chunks(planes.shape[3]):
+            local, plane = _part(points, chunk), planes[..., chunk].contiguous()
+            g = (grad[chunk].permute(2, 1, 0) if ctx.rows else grad[:, :, chunk]).contiguous()
+            for row in range(3):
+                for axis in range(3):
+                    planes_grad[row, axis, :, chunk] = sparse_product(transpose, g[row] * local[axis])
+                planes_grad[row, 3, :, chunk] = sparse_product(transpose, g[row])
+            for axis in range(3):
+                total = sparse_product(weights, plane[0, axis]).mul_(g[0])
+                total.addcmul_(sparse_product(weights, plane[1, axis]), g[1])
+                total.addcmul_(sparse_product(weights, plane[2, axis]), g[2])
+                if points.shape[2] == 1:
+                    points_grad[axis, :, 0] += total.sum(1)
+                else:
+                    points_grad[axis, :, chunk] = total
+        return points_grad, planes_grad, None, None, None, None, None, None, None
+
+
 class Skinning(torch.nn.Module):
     """Skin weights (v, J) as constants; computes ``y_v = sum_k w_vk M_k (x_v; 1)``.
 
-    Vertices travel as (v, 3, B), batch innermost, so that one sparse row touches B poses at once.
+    Vertices travel as planes (3, v, B), batch innermost, so that one sparse row touches many poses at once
+    and every elementwise step runs over contiguous memory.
     """
 
     def __init__(self, weights: scipy.sparse.csr_array, *, dtype: torch.dtype, device: torch.device | str) -> None:
@@ -49,41 +114,30 @@ class Skinning(torch.nn.Module):
         keep("point_t_order", turned.data)
         keep("influence_vertex", np.repeat(np.arange(vertices), np.diff(weights.indptr)))
 
-    def forward(self, vertices: Tensor, transforms: Tensor) -> Tensor:
-        """Skinned vertices (v, 3, B).
+    def forward(self, points: Tensor, transforms: Tensor, *, rows: bool) -> Tensor:
+        """Skinned vertices: contiguous (B, v, 3) when `rows`, else planes (3, v, B).
 
         Args:
-            vertices: (v, 3, B) or (v, 3, 1) [m].
+            points: (3, v, B) or (3, v, 1) [m].
             transforms: (B, J, 3, 4) from :func:`skinning_transforms`.
         """
-        parts = [
-            self._blend(vertices if vertices.shape[2] == 1 else vertices[:, :, start : start + _CHUNK],
-                        transforms[start : start + _CHUNK])
-            for start in range(0, len(transforms), _CHUNK)
-        ]  # fmt: skip
-        return parts[0] if len(parts) == 1 else torch.cat(parts, 2)
-
-    def _blend(self, vertices: Tensor, transforms: Tensor) -> Tensor:
-        planes = transforms.permute(2, 3, 1, 0).contiguous()  # (3, 4, J, B)
-        rows = []
-        for row in planes:
-            turned = self.weights(row[0]) * vertices[:, 0]
-            turned = torch.addcmul(turned, self.weights(row[1]), vertices[:, 1])
-            turned = torch.addcmul(turned, self.weights(row[2]), vertices[:, 2])
-            rows.append(turned + self.weights(row[3]))
-        return torch.stack(rows, 1)
+        planes = transforms.permute(2, 3, 1, 0)
+        return _Blend.apply(points, planes, rows, *self.weights.csr, *self.weights.transpose)
 
     def shared(self, vertices: Tensor, transforms: Tensor) -> Tensor:
-        """Skin one body in many poses: (v, 3) and (B, J, 3, 4) -> (v, 3, B); constant in `vertices`.
+        """Skin one body in many poses: (v, 3) and (B, J, 3, 4) -> (B, v, 3); constant in `vertices`.
 
         Weights and points fold into one sparse matrix (v, 4 J), so a pose costs one sparse product.
         Gradients reach the transforms only.
         """
         point = torch.cat((vertices, torch.ones_like(vertices[:, :1])), 1)
         values = (self.weights.val[:, None] * point[self.influence_vertex]).ravel()
-        batch, joints = transforms.shape[:2]
-        dense = transforms.permute(1, 3, 2, 0).reshape(4 * joints, 3 * batch)
         pattern = (self.point_crow, self.point_col, values)
-        turned = values[self.point_t_order] if dense.requires_grad else values
-        out = gather_rows(dense, pattern, (self.point_t_crow, self.point_t_col, turned))
-        return out.view(-1, 3, batch)
+        turned = values[self.point_t_order] if transforms.requires_grad else values
+        transpose = (self.point_t_crow, self.point_t_col, turned)
+        dense = transforms.permute(1, 3, 2, 0).flatten(0, 1)  # (4 J, 3, B)
+        parts = []
+        for chunk in _chunks(len(transforms)):
+            part = gather_rows(dense[..., chunk].flatten(1), pattern, transpose)
+            parts.append(part.view(len(vertices), 3, -1).permute(2, 0, 1))
+        return parts[0].contiguous() if len(parts) == 1 else torch.cat(parts)

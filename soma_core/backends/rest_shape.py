@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 import numpy as np
+import scipy.sparse
 import torch
 from torch import Tensor
 
@@ -30,9 +31,9 @@ class ExactRestShape(torch.nn.Module):
         self.generator, self.transfer, self.fit = generator, transfer, fit
 
     def forward(self, params: Mapping[str, Tensor]) -> tuple[Tensor, Tensor]:
-        """Vertices (v, 3, B) [m] and fitted transforms (B, J, 4, 4) [m]."""
+        """Vertices as planes (3, v, B) [m] and fitted transforms (B, J, 4, 4) [m]."""
         vertices = self.transfer(self.generator.rest(params))
-        return vertices.permute(1, 2, 0), self.fit(vertices)
+        return vertices.permute(2, 1, 0), self.fit(vertices)
 
 
 class ComposedRestShape(torch.nn.Module):
@@ -50,31 +51,36 @@ class ComposedRestShape(torch.nn.Module):
         composed = compose(linear, transfer, at)
         self.vertex_count = len(composed.template) // 3
         matrix = fit.matrix
-        moments = _apply_rows(matrix, composed.template[:, None])
-        self.register_buffer("template", torch.cat((composed.template[:, None], moments)), persistent=False)
-        basis = torch.cat((composed.basis, _apply_rows(matrix, composed.basis)))
-        self.register_buffer("basis", basis, persistent=False)
+        self.register_buffer("template", _stack(matrix, composed.template[:, None]), persistent=False)
+        self.register_buffer("basis", _stack(matrix, composed.basis), persistent=False)
         self.exact = composed.exact
         if self.exact is not None:
             columns = matrix.tocsc()[:, self.exact.rows.cpu().numpy()].toarray()
-            tensor = torch.as_tensor(columns, dtype=basis.dtype, device=basis.device)
+            tensor = torch.as_tensor(columns, dtype=self.basis.dtype, device=self.basis.device)
             self.register_buffer("offset_moments", tensor, persistent=False)
 
     def forward(self, params: Mapping[str, Tensor]) -> tuple[Tensor, Tensor]:
-        """Vertices (v, 3, B) [m] and fitted transforms (B, J, 4, 4) [m]."""
+        """Vertices as planes (3, v, B) [m] and fitted transforms (B, J, 4, 4) [m]."""
         coefficients = self.coefficients(params)
         stacked = torch.addmm(self.template, self.basis, coefficients.T)
         batch, size = len(coefficients), 3 * self.vertex_count
-        vertices, moments = stacked[:size].view(-1, 3, batch), stacked[size:].view(-1, 3, batch)
+        points, moments = stacked[:size].view(3, -1, batch), stacked[size:].view(-1, 3, batch)
         if self.exact is not None:
             offsets = self.exact.evaluate(coefficients)
-            vertices = vertices.index_add(0, self.exact.rows, offsets)
+            points = points.index_add(1, self.exact.rows, offsets.transpose(0, 1))
             moments = moments + (self.offset_moments @ offsets.flatten(1)).view(-1, 3, batch)
         moments = moments.view(self.fit.joint_count, 4, 3, batch).permute(3, 0, 1, 2)
-        return vertices, self.fit.from_moments(moments)
+        return points, self.fit.from_moments(moments)
 
 
-def _apply_rows(matrix, flat: Tensor) -> Tensor:
+def _stack(matrix: scipy.sparse.csr_array, vertex_major: Tensor) -> Tensor:
+    """Columns (v * 3, k) as planes (3 * v, k), with their moments (m * 3, k) underneath."""
+    count, columns = vertex_major.shape[0] // 3, vertex_major.shape[1]
+    planes = vertex_major.view(count, 3, columns).transpose(0, 1).reshape(3 * count, columns)
+    return torch.cat((planes, _apply_rows(matrix, vertex_major)))
+
+
+def _apply_rows(matrix: scipy.sparse.csr_array, flat: Tensor) -> Tensor:
     """(m, v) sparse times (v * 3, k) vertex-major columns -> (m * 3, k), in float64."""
     count, columns = flat.shape[0] // 3, flat.shape[1]
     parts = []

@@ -55,51 +55,16 @@ def matrix_to_axis_angle(matrix: Tensor) -> Tensor:
     Goes through the quaternion whose largest component is largest among four candidates, so it is
     accurate at every angle; at exactly pi one of the two valid axes is returned.
     """
-    m = matrix
-    trace = m[..., 0, 0] + m[..., 1, 1] + m[..., 2, 2]
-    w = torch.stack(
-        [
-            torch.stack(
-                [
-                    1 + trace,
-                    m[..., 2, 1] - m[..., 1, 2],
-                    m[..., 0, 2] - m[..., 2, 0],
-                    m[..., 1, 0] - m[..., 0, 1],
-                ],
-                -1,
-            ),
-            torch.stack(
-                [
-                    m[..., 2, 1] - m[..., 1, 2],
-                    1 + 2 * m[..., 0, 0] - trace,
-                    m[..., 0, 1] + m[..., 1, 0],
-                    m[..., 0, 2] + m[..., 2, 0],
-                ],
-                -1,
-            ),
-            torch.stack(
-                [
-                    m[..., 0, 2] - m[..., 2, 0],
-                    m[..., 0, 1] + m[..., 1, 0],
-                    1 + 2 * m[..., 1, 1] - trace,
-                    m[..., 1, 2] + m[..., 2, 1],
-                ],
-                -1,
-            ),
-            torch.stack(
-                [
-                    m[..., 1, 0] - m[..., 0, 1],
-                    m[..., 0, 2] + m[..., 2, 0],
-                    m[..., 1, 2] + m[..., 2, 1],
-                    1 + 2 * m[..., 2, 2] - trace,
-                ],
-                -1,
-            ),
-        ],
-        -2,
-    )  # rows: candidates, columns: (w, x, y, z); row k is 4 q_k q
-    largest = torch.diagonal(w, dim1=-2, dim2=-1).argmax(-1)
-    quaternion = torch.take_along_dim(w, largest[..., None, None], -2).squeeze(-2)
+    xx, xy, xz, yx, yy, yz, zx, zy, zz = matrix.flatten(-2).unbind(-1)
+    entries = (
+        1 + xx + yy + zz, zy - yz, xz - zx, yx - xy,
+        zy - yz, 1 + xx - yy - zz, xy + yx, xz + zx,
+        xz - zx, xy + yx, 1 + yy - xx - zz, yz + zy,
+        yx - xy, xz + zx, yz + zy, 1 + zz - xx - yy,
+    )  # fmt: skip
+    candidates = torch.stack(entries, -1).unflatten(-1, (4, 4))  # row k is 4 q_k (w, x, y, z)
+    largest = torch.diagonal(candidates, dim1=-2, dim2=-1).argmax(-1)
+    quaternion = torch.take_along_dim(candidates, largest[..., None, None], -2).squeeze(-2)
     quaternion = quaternion / quaternion.norm(dim=-1, keepdim=True)
     quaternion = torch.where(quaternion[..., :1] < 0, -quaternion, quaternion)
     scalar, vector = quaternion[..., 0], quaternion[..., 1:]

@@ -8,10 +8,16 @@ import torch
 from torch import Tensor
 from torch.nn.functional import embedding_bag
 
-__all__ = ["SparseRows", "gather_rows"]
+__all__ = ["Csr", "SparseRows", "gather_rows", "sparse_product"]
 
 Csr = tuple[Tensor, Tensor, Tensor]
 """Row starts (m + 1,), column ids (e,), values (e,)."""
+
+
+def sparse_product(matrix: Csr, dense: Tensor) -> Tensor:
+    """Product of a sparse (m, n) matrix in CSR form and a contiguous dense (n, f) one; no derivative."""
+    crow, col, val = matrix
+    return embedding_bag(col, dense, crow, mode="sum", per_sample_weights=val, include_last_offset=True)
 
 
 class _Gather(torch.autograd.Function):
@@ -19,7 +25,7 @@ class _Gather(torch.autograd.Function):
 
     @staticmethod
     def forward(dense, crow, col, val, _t_crow, _t_col, _t_val):
-        return embedding_bag(col, dense, crow, mode="sum", per_sample_weights=val, include_last_offset=True)
+        return sparse_product((crow, col, val), dense)
 
     @staticmethod
     def setup_context(ctx, inputs, _output) -> None:
@@ -27,10 +33,7 @@ class _Gather(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx, grad):
-        crow, col, val = ctx.saved_tensors
-        back = embedding_bag(
-            col, grad.contiguous(), crow, mode="sum", per_sample_weights=val, include_last_offset=True
-        )
+        back = sparse_product(ctx.saved_tensors, grad.contiguous())
         return back, None, None, None, None, None, None
 
 

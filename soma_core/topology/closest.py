@@ -14,15 +14,19 @@ class ClosestFaces:
     """A mesh prepared for queries.
 
     The BVH works in float32 and returns any one of the faces that share the closest point. All faces
-    touching that face are then measured in float64, and the lowest id among the nearest wins: the
-    answer is deterministic and does not depend on the tree.
+    touching that face, also across vertices that merely coincide, are then measured in float64, and the
+    lowest id among the nearest wins: the answer does not depend on the tree. Only a point exactly between
+    two separate sheets may get either of them.
     """
 
     def __init__(self, vertices: np.ndarray, triangles: np.ndarray) -> None:
         self._vertices, self._triangles = vertices, triangles
-        order = np.argsort(triangles.ravel(), kind="stable")
+        _, place = np.unique(vertices, axis=0, return_inverse=True)
+        self._corner_place = place.ravel()[triangles]
+        corners = self._corner_place.ravel()
+        order = np.argsort(corners, kind="stable")
         self._face_of_corner = order // 3
-        self._start = np.searchsorted(triangles.ravel()[order], np.arange(len(vertices) + 1))
+        self._start = np.searchsorted(corners[order], np.arange(len(vertices) + 1))
 
     def query(self, points: np.ndarray) -> np.ndarray:
         """Id of the closest face of each point; (m, 3) -> (m,) int64."""
@@ -43,9 +47,9 @@ class ClosestFaces:
         return best
 
     def _touching(self, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Pairs (query, face): every face that shares a vertex with the query's proposed face."""
-        vertices = self._triangles[faces]
-        begin, end = self._start[vertices], self._start[vertices + 1]
+        """Pairs (query, face): every face that shares a corner with the query's proposed face."""
+        places = self._corner_place[faces]
+        begin, end = self._start[places], self._start[places + 1]
         counts = (end - begin).ravel()
         query = np.repeat(np.repeat(np.arange(len(faces)), 3), counts)
         first = np.repeat(begin.ravel() - np.concatenate([[0], np.cumsum(counts)[:-1]]), counts)

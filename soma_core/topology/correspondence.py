@@ -22,6 +22,9 @@ _CODE_VERSION = "3"
 _FAR = 0.02
 """Median distance, relative to the bounding diagonal, above which a pair cannot be meant."""
 
+_OTHER_SIZE = 2.0
+"""Ratio of the bounding diagonals above which a pair cannot be meant either."""
+
 _DEGENERATE = 1e-10
 """Twice the area over squared edge length under which a face has no usable plane."""
 
@@ -116,9 +119,10 @@ def _usable_faces(vertices: np.ndarray, triangles: np.ndarray) -> np.ndarray:
 def _refuse_distant(native: np.ndarray, wrap: np.ndarray, distances: np.ndarray) -> None:
     diagonal = float(np.linalg.norm(np.ptp(native, axis=0)))
     median = float(np.median(distances))
-    if median <= _FAR * diagonal:
-        return
     ratio = diagonal / max(float(np.linalg.norm(np.ptp(wrap, axis=0))), 1e-300)
+    # A wrap shrunk a hundred times lies near the surface as well where the origin does, at the feet.
+    if median <= _FAR * diagonal and 1 / _OTHER_SIZE < ratio < _OTHER_SIZE:
+        return
     factor = min((100.0, 10.0, 0.1, 0.01, 1000.0, 0.001), key=lambda f: abs(np.log(ratio / f)))
     scaled = abs(np.log(ratio / factor)) < 0.4
     cause = f"Scale the wrap by {factor:g}: the two files are in different units." if scaled else (
@@ -126,8 +130,9 @@ def _refuse_distant(native: np.ndarray, wrap: np.ndarray, distances: np.ndarray)
     )  # fmt: skip
     raise InputError(
         "wrap",
-        got=f"a median distance of {median / diagonal:.1%} of the body's diagonal to the native surface",
-        expected=f"at most {_FAR:.0%}",
+        got=f"a median distance of {median / diagonal:.1%} of the body's diagonal to the native surface, "
+        f"and {1 / ratio:.3g} times its size",
+        expected=f"at most {_FAR:.0%}, and about the same size",
         fix=cause,
     )
 

@@ -90,12 +90,12 @@ def _canonical_edges(mesh: CanonicalMesh) -> np.ndarray:
     corner = np.arange(len(mesh.face_vert_indices))
     face = np.repeat(np.arange(len(starts)), mesh.face_vert_counts)
     following = starts[face] + (corner - starts[face] + 1) % mesh.face_vert_counts[face]
-    return _edge_keys(mesh.face_vert_indices, mesh.face_vert_indices[following])
+    return np.unique(_edge_keys(mesh.face_vert_indices, mesh.face_vert_indices[following]))
 
 
 def _edge_keys(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     low, high = np.minimum(a, b).astype(np.int64), np.maximum(a, b).astype(np.int64)
-    return np.unique(low << 32 | high)
+    return low << 32 | high
 
 
 def check_wrap(vertices: np.ndarray, triangles: np.ndarray, mesh: CanonicalMesh, *, path: Path) -> None:
@@ -108,10 +108,7 @@ def check_wrap(vertices: np.ndarray, triangles: np.ndarray, mesh: CanonicalMesh,
             fix="Export the wrap without merging, splitting or removing vertices.",
         )
     canonical = _canonical_edges(mesh)
-    keys = [
-        np.minimum(triangles[:, i], triangles[:, j]) << 32 | np.maximum(triangles[:, i], triangles[:, j])
-        for i, j in ((0, 1), (1, 2), (2, 0))
-    ]
+    keys = [_edge_keys(triangles[:, i], triangles[:, j]) for i, j in ((0, 1), (1, 2), (2, 0))]
     on_edges = sum(np.isin(key, canonical).astype(int) for key in keys)
     strange = int((on_edges < 2).sum())
     if strange:
