@@ -84,7 +84,11 @@ def compose(
         linear: template (n, 3) and basis (k, n, 3), native.
         transfer: the backend's exact transfer.
         at: coefficients (k,) of the body that offsets are linearised at.
+
+    Raises:
+        InputError: the template is not the mesh that `transfer` was made for.
     """
+    transfer.check((1, *linear.template.shape))
     if isinstance(transfer, CanonicalPassThrough):
         return _compose_pass_through(linear, transfer)
     count = len(transfer.corners)

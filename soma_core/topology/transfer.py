@@ -73,19 +73,23 @@ class TopologyTransfer(torch.nn.Module):
 
     def forward(self, native: Tensor) -> Tensor:
         """Canonical rest vertices (B, v, 3) [m] from native vertices (B, n, 3). Differentiable."""
-        if native.ndim != 3 or native.shape[1:] != (self.native_count, 3):
-            raise InputError(
-                "native vertices",
-                got=tuple(native.shape),
-                expected=f"(batch, {self.native_count}, 3), as in the wrap pair",
-                fix="The generator and its wrap pair must describe the same mesh.",
-            )
+        self.check(native.shape)
         batch, count = len(native), len(self.corners)
         flat = native.permute(1, 2, 0).reshape(self.native_count, 3 * batch)
         plane = self.affine(flat).view(count, 3, batch)
         raised = self.height[:, None] * raised_normal(native[:, self.corners])
         points = self.fill((plane + raised.permute(1, 2, 0)).reshape(count, 3 * batch))
         return self.to_canonical(points.view(count, 3, batch)).permute(2, 0, 1)
+
+    def check(self, shape: tuple[int, ...]) -> None:
+        """Refuse native vertices that are not those of the wrap pair."""
+        if len(shape) != 3 or tuple(shape[1:]) != (self.native_count, 3):
+            raise InputError(
+                "native vertices",
+                got=tuple(shape),
+                expected=f"(batch, {self.native_count}, 3), as in the wrap pair",
+                fix="The generator and its wrap pair must describe the same mesh.",
+            )
 
     def to_canonical(self, points: Tensor) -> Tensor:
         """Change axes and unit of (v, 3, f) native vectors."""
@@ -99,7 +103,7 @@ class CanonicalPassThrough(torch.nn.Module):
         self, spec: BackendSpec, mesh: CanonicalMesh, *, dtype: torch.dtype, device: torch.device | str
     ) -> None:
         super().__init__()
-        self.native_count = int(mesh.mid_ids.max()) + 1 if mesh.lod == "mid" else None
+        self.least_count, self.is_mid = int(mesh.mid_ids.max()) + 1, mesh.lod == "mid"
         frame = METRES[spec.unit] * native_to_canonical(spec.up, spec.forward)
         self.register_buffer("frame", torch.as_tensor(frame, dtype=dtype, device=device), persistent=False)
         ids = torch.as_tensor(mesh.mid_ids.astype(np.int64), device=device)
@@ -107,14 +111,20 @@ class CanonicalPassThrough(torch.nn.Module):
 
     def forward(self, native: Tensor) -> Tensor:
         """Canonical rest vertices (B, v, 3) [m] from mid-LOD native vertices (B, n, 3)."""
-        if self.native_count is not None and native.shape[1:] != (self.native_count, 3):
+        self.check(native.shape)
+        return native[:, self.mid_ids] @ self.frame.T
+
+    def check(self, shape: tuple[int, ...]) -> None:
+        """Refuse native vertices that are not canonical ones; a lower LOD only knows how many there must be."""
+        fits = len(shape) == 3 and shape[2] == 3 and shape[1] >= self.least_count
+        if not fits or (self.is_mid and shape[1] != self.least_count):
+            more = "" if self.is_mid else " or more"
             raise InputError(
                 "native vertices",
-                got=tuple(native.shape),
-                expected=f"(batch, {self.native_count}, 3), the canonical mesh",
+                got=tuple(shape),
+                expected=f"(batch, {self.least_count}{more}, 3), the canonical mesh",
                 fix="Declare a wrap pair, or generate vertices in canonical order.",
             )
-        return native[:, self.mid_ids] @ self.frame.T
 
 
 def make_transfer(
