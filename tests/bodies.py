@@ -51,8 +51,8 @@ JOINTS: dict[str, tuple[str | None, tuple[float, float, float]]] = {
 }
 WEIGHTLESS = ("Root", "HeadEnd", "LeftToeEnd")
 BAGS = {
-    "mouth_bag": [((0.0, 0.55, 0.83), 0.3)],
-    "eye_bags": [((0.4, 0.8, 0.45), 0.2), ((-0.4, 0.8, 0.45), 0.2)],
+    "mouth_bag": [((0.0, 0.25, 0.95), 0.3)],
+    "eye_bags": [((0.45, 0.8, 0.4), 0.2), ((-0.45, 0.8, 0.4), 0.2)],
 }
 
 
