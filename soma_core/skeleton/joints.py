@@ -21,11 +21,12 @@ def joint_neighbourhoods(mesh: CanonicalMesh, rig: Rig) -> list[np.ndarray]:
     """Vertex ids that carry each joint; the root's list is empty.
 
     The crease around a joint: vertices weighted to the joint *and* its parent; if there are none, those
-    of the joint; if still none, those of its ancestors, nearest first. Never the face interior.
+    of the joint; if still none, those of its ancestors, nearest first; at last all. Never the face interior.
     """
     weighted = (rig.weights.toarray() > 0) if rig.weights.nnz else np.zeros(rig.weights.shape, bool)
     interior = np.zeros(mesh.vertex_count, bool)
     interior[mesh.face_interior] = True
+    weighted[interior] = False
     result = [np.empty(0, np.int64)]
     for joint in range(1, rig.joint_count):
         parent = int(rig.parents[joint])
@@ -35,7 +36,7 @@ def joint_neighbourhoods(mesh: CanonicalMesh, rig: Rig) -> list[np.ndarray]:
         while not chosen.any() and parent >= 0:
             chosen |= weighted[:, parent]
             parent = int(rig.parents[parent])
-        result.append(np.flatnonzero(chosen & ~interior))
+        result.append(np.flatnonzero(chosen if chosen.any() else ~interior))
     return result
 
 
@@ -65,9 +66,11 @@ def joint_regressor(mesh: CanonicalMesh, rig: Rig) -> scipy.sparse.csr_array:
     Rows sum to one except the root's, which is empty: the root is pinned to the origin. Cached on disk
     by rig revision. Paper, equations 2 to 4, with the weights fixed at the bind shape.
     """
+    weights = (rig.weights.data, rig.weights.indices, rig.weights.indptr)
     key = content_key(
-        "joint_regressor", _CODE_VERSION, rig.revision, rig.bind_shape, rig.bind_world, rig.weights.data
-    )
+        "joint_regressor", _CODE_VERSION, rig.revision, rig.bind_shape, rig.bind_world, rig.parents, *weights,
+        mesh.face_interior,
+    )  # fmt: skip
     arrays = cached_arrays("joint_regressor", key, lambda: _build(mesh, rig))
     return scipy.sparse.csr_array(
         (arrays["data"], arrays["indices"], arrays["indptr"]), shape=(rig.joint_count, mesh.vertex_count)

@@ -115,7 +115,7 @@ class CanonicalPassThrough(torch.nn.Module):
         return native[:, self.mid_ids] @ self.frame.T
 
     def check(self, shape: tuple[int, ...]) -> None:
-        """Refuse native vertices that are not canonical ones; a lower LOD only knows how many there must be."""
+        """Refuse native vertices that are not canonical; a lower LOD only knows their least count."""
         fits = len(shape) == 3 and shape[2] == 3 and shape[1] >= self.least_count
         if not fits or (self.is_mid and shape[1] != self.least_count):
             more = "" if self.is_mid else " or more"
