@@ -24,6 +24,9 @@ __all__ = ["Kernels", "SomaLayer"]
 
 Kernels = Literal["auto", "torch", "warp"]
 
+_CHUNK = 32
+"""Bodies evaluated at a time where nothing is kept for a gradient."""
+
 
 class SomaLayer(torch.nn.Module):
     """Any identity backend, animated on the canonical rig.
@@ -112,7 +115,9 @@ class SomaLayer(torch.nn.Module):
             An immutable identity [m]; paper, sections 3.2 to 3.4. Differentiable in every parameter.
         """
         batch = batch_parameters(self.spec, params, device=self.device, dtype=self.dtype)
-        points, fitted = self.rest_shape(batch)
+        return self._identity(batch, *self.rest_shape(batch))
+
+    def _identity(self, params: Mapping[str, Tensor], points: Tensor, fitted: Tensor) -> Identity:
         rest, bind = self.animation.repose(points, fitted) if self.repose else (points, fitted)
         return Identity(
             rest=rest.permute(2, 1, 0),
@@ -121,7 +126,7 @@ class SomaLayer(torch.nn.Module):
             fitted_world=fitted,
             backend=self.backend,
             rig_revision=self.rig.revision,
-            params=batch,
+            params=params,
         )
 
     def pose(
@@ -159,8 +164,29 @@ class SomaLayer(torch.nn.Module):
         *,
         absolute: bool = False,
     ) -> Posed:
-        """``pose(identity(params), rotations, translation)``."""
-        return self.pose(self.identity(params), rotations, translation, absolute=absolute)
+        """``pose(identity(params), rotations, translation)``; identities are not kept.
+
+        Without gradients a large batch runs through in chunks that stay in cache.
+        """
+        batch = batch_parameters(self.spec, params, device=self.device, dtype=self.dtype)
+        relative = check_rotations(rotations, len(self.joint_names), self.dtype, self.device, validate=self.validate)
+        identities = len(next(iter(batch.values()), relative))
+        size = _common_batch(identities, len(relative))
+        shift = check_translation(translation, size, self.dtype, self.device, validate=self.validate)
+        relative = relative.expand(size, *relative.shape[1:])
+        tracked = torch.is_grad_enabled() and any(
+            tensor.requires_grad for tensor in (*batch.values(), relative, shift)
+        )
+        whole = tracked or identities < size or size <= _CHUNK or self.animation.warp_skinning
+        if whole:
+            identity = self._identity(batch, *self.rest_shape(batch))
+            return self.animation.pose(identity, relative, shift, absolute=absolute)
+        parts = (
+            ({name: value[chunk] for name, value in batch.items()}, relative[chunk], shift[chunk])
+            for chunk in (slice(start, start + _CHUNK) for start in range(0, size, _CHUNK))
+        )
+        bodies = ((self._identity(part, *self.rest_shape(part)), turn, place) for part, turn, place in parts)
+        return self.animation.pose_all(bodies, size, absolute=absolute)
 
 
 def _common_batch(identities: int, poses: int) -> int:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import Literal
 
 import torch
@@ -54,17 +55,44 @@ class Animation(torch.nn.Module):
 
     def pose(self, identity: Identity, relative: Tensor, translation: Tensor, *, absolute: bool) -> Posed:
         """Posed bodies; `relative` (B, J - 1, 3, 3) and `translation` (B, 3) [m] are already checked."""
-        kinematics = self.kinematics
-        if absolute:
-            relative = relative_from_absolute(relative, kinematics.orient[1:], kinematics.parent_orient[1:])
-        offsets = kinematics.local_offsets(identity.bind_world)
-        rotations, positions = kinematics(relative, offsets, translation)
+        rotations, positions = self._walk(identity, relative, translation, absolute=absolute)
         transforms = skinning_transforms(rotations, positions, identity.bind_world)
         return Posed(
             vertices=self._skin(identity.rest, transforms),
             joints=positions[:, 1:],
             transforms=to_homogeneous(rotations, positions),
         )
+
+    def pose_all(
+        self, bodies: Iterable[tuple[Identity, Tensor, Tensor]], batch: int, *, absolute: bool
+    ) -> Posed:
+        """Pose a stream of (identity, relative, translation) chunks, each dropped after use; no derivative.
+
+        Args:
+            bodies: chunks that add up to `batch` bodies, one identity a pose.
+            batch: total number of bodies.
+        """
+        vertices, world, start = None, [], 0
+        for identity, relative, translation in bodies:
+            if vertices is None:
+                vertices = identity.rest.new_empty(batch, *identity.rest.shape[1:])
+            rotations, positions = self._walk(identity, relative, translation, absolute=absolute)
+            transforms = skinning_transforms(rotations, positions, identity.bind_world)
+            stop = start + len(relative)
+            self.skinning.into(vertices[start:stop], identity.rest.permute(2, 1, 0), transforms)
+            world.append(to_homogeneous(rotations, positions))
+            start = stop
+        joined = torch.cat(world)
+        return Posed(vertices=vertices, joints=joined[:, 1:, :3, 3], transforms=joined)
+
+    def _walk(
+        self, identity: Identity, relative: Tensor, translation: Tensor, *, absolute: bool
+    ) -> tuple[Tensor, Tensor]:
+        """World rotations and positions of the joints."""
+        if absolute:
+            kinematics = self.kinematics
+            relative = relative_from_absolute(relative, kinematics.orient[1:], kinematics.parent_orient[1:])
+        return self.kinematics(relative, self.kinematics.local_offsets(identity.bind_world), translation)
 
     def _skin(self, rest: Tensor, transforms: Tensor) -> Tensor:
         """Posed vertices (B, v, 3), contiguous, from rest vertices (B or 1, v, 3)."""

@@ -9,7 +9,7 @@ import scipy.sparse
 import torch
 from torch import Tensor
 
-from soma_core.geometry.sparse import SparseRows, gather_rows, sparse_product
+from soma_core.geometry.sparse import Csr, SparseRows, gather_rows, sparse_product
 
 __all__ = ["Skinning", "skinning_transforms"]
 
@@ -34,6 +34,22 @@ def _part(points: Tensor, chunk: slice) -> Tensor:
     return points if points.shape[2] == 1 else points[:, :, chunk]
 
 
+def _blend_into(out: Tensor, points: Tensor, planes: Tensor, weights: Csr, *, rows: bool) -> None:
+    """Skin a chunk of poses at a time into `out`: (B, v, 3) when `rows`, else (3, v, B)."""
+    count, batch = len(weights[0]) - 1, planes.shape[3]
+    for chunk in _chunks(batch):
+        local, plane = _part(points, chunk), planes[..., chunk].contiguous()
+        width = plane.shape[3]
+        target = planes.new_empty(count, 3, width).transpose(0, 1) if rows else out[:, :, chunk]
+        for row in range(3):
+            total = sparse_product(weights, plane[row, 3])
+            total.addcmul_(sparse_product(weights, plane[row, 0]), local[0])
+            total.addcmul_(sparse_product(weights, plane[row, 1]), local[1])
+            torch.addcmul(total, sparse_product(weights, plane[row, 2]), local[2], out=target[row])
+        if rows:
+            out[chunk] = target.permute(2, 1, 0)
+
+
 class _Blend(torch.autograd.Function):
     """Blend, apply and lay out, one chunk of poses at a time, with a backward pass that keeps nothing.
 
@@ -42,19 +58,9 @@ class _Blend(torch.autograd.Function):
 
     @staticmethod
     def forward(points, planes, rows, crow, col, val, t_crow, t_col, t_val):
-        weights, count, batch = (crow, col, val), len(crow) - 1, planes.shape[3]
+        count, batch = len(crow) - 1, planes.shape[3]
         out = planes.new_empty((batch, count, 3) if rows else (3, count, batch))
-        for chunk in _chunks(batch):
-            local, plane = _part(points, chunk), planes[..., chunk].contiguous()
-            width = plane.shape[3]
-            target = planes.new_empty(count, 3, width).transpose(0, 1) if rows else out[:, :, chunk]
-            for row in range(3):
-                total = sparse_product(weights, plane[row, 3])
-                total.addcmul_(sparse_product(weights, plane[row, 0]), local[0])
-                total.addcmul_(sparse_product(weights, plane[row, 1]), local[1])
-                target[row] = total.addcmul_(sparse_product(weights, plane[row, 2]), local[2])
-            if rows:
-                out[chunk] = target.permute(2, 1, 0)
+        _blend_into(out, points, planes, (crow, col, val), rows=rows)
         return out
 
     @staticmethod
@@ -123,6 +129,10 @@ class Skinning(torch.nn.Module):
         """
         planes = transforms.permute(2, 3, 1, 0)
         return _Blend.apply(points, planes, rows, *self.weights.csr, *self.weights.transpose)
+
+    def into(self, out: Tensor, points: Tensor, transforms: Tensor) -> None:
+        """Write skinned vertices into `out`, contiguous (B, v, 3); no derivative."""
+        _blend_into(out, points, transforms.permute(2, 3, 1, 0), self.weights.csr, rows=True)
 
     def shared(self, vertices: Tensor, transforms: Tensor) -> Tensor:
         """Skin one body in many poses: (v, 3) and (B, J, 3, 4) -> (B, v, 3); constant in `vertices`.

@@ -39,9 +39,14 @@ def scalar_name(dtype: torch.dtype) -> str:
     return str(dtype).removeprefix("torch.")
 
 
-def as_warp(tensor: torch.Tensor, dtype: Any = None) -> wp.array:
-    """A Warp view of a tensor's memory; no copy when it is contiguous, no gradient."""
-    return wp.from_torch(tensor.detach().contiguous(), dtype=dtype, requires_grad=False)
+def as_warp(tensor: torch.Tensor, dtype: Any = None) -> Any:
+    """Descriptor of a contiguous tensor's memory for one launch.
+
+    It holds no reference: the caller keeps the tensor alive until the launch was issued. (Full Warp
+    arrays cost more to make than a small kernel runs.)
+    """
+    assert tensor.is_contiguous(), tensor.stride()
+    return wp.from_torch(tensor, dtype=dtype, requires_grad=False, return_ctype=True)
 
 
 @contextlib.contextmanager

@@ -68,16 +68,18 @@ def _walk_backward(
     kernels = _kernels(scalar_name(relative.dtype))
     relative_grad, offsets_grad = torch.zeros_like(relative), torch.zeros_like(offsets)
     matrices, vectors = kernels.mat33, kernels.vec3
+    # The walk writes its outputs again and accumulates into their gradients, so it gets copies.
+    turns, positions = turns.clone(), positions.clone()
+    turns_grad = turns_grad.clone(memory_format=torch.contiguous_format)
+    positions_grad = positions_grad.clone(memory_format=torch.contiguous_format)
     with launching(relative) as device:
         wp.launch(
             kernels.walk,
             dim=len(relative),
             inputs=[as_warp(order), as_warp(parents), as_warp(relative, matrices), as_warp(offsets, vectors)],
-            outputs=[as_warp(turns.clone(), matrices), as_warp(positions.clone(), vectors)],
-            # The walk accumulates into the gradients of its own outputs, so it gets copies of them.
+            outputs=[as_warp(turns, matrices), as_warp(positions, vectors)],
             adj_inputs=[None, None, as_warp(relative_grad, matrices), as_warp(offsets_grad, vectors)],
-            adj_outputs=[as_warp(turns_grad.clone(memory_format=torch.contiguous_format), matrices),
-                         as_warp(positions_grad.clone(memory_format=torch.contiguous_format), vectors)],
+            adj_outputs=[as_warp(turns_grad, matrices), as_warp(positions_grad, vectors)],
             adjoint=True,
             device=device,
         )  # fmt: skip
@@ -105,9 +107,9 @@ def forward_kinematics(relative: Tensor, offsets: Tensor, order: Tensor, parents
     """Accumulated turns (B, J, 3, 3) and world positions (B, J, 3) [m] down the joint tree.
 
     Args:
-        relative: (B, J, 3, 3) T-pose-relative rotations, the root's included; contiguous.
-        offsets: (B, J, 3) bone vectors in T-pose world axes [m]; contiguous.
+        relative: (B, J, 3, 3) T-pose-relative rotations, the root's included.
+        offsets: (B, J, 3) bone vectors in T-pose world axes [m].
         order: (J,) int64, parents before children.
         parents: (J,) int64, -1 for the root.
     """
-    return _walk(relative, offsets, order, parents)
+    return _walk(relative.contiguous(), offsets.contiguous(), order, parents)

@@ -21,6 +21,8 @@ def _rotation_functions(scalar: str, module: wp.Module) -> SimpleNamespace:
     prior = wp.constant(real(PRIOR_STRENGTH))
     floor = wp.constant(real(1e-24 if scalar == "float32" else 1e-162))
     tiny = wp.constant(real(1e-30 if scalar == "float32" else 1e-100))
+    newton_steps = wp.constant(_NEWTON_STEPS)
+    converged = wp.constant(real(1e-9 if scalar == "float32" else 1e-20))
     opposite = wp.constant(real(1e-7 if scalar == "float32" else 1e-12))
 
     @wp.func(module=module)
@@ -39,13 +41,19 @@ def _rotation_functions(scalar: str, module: wp.Module) -> SimpleNamespace:
         scale = wp.sqrt(wp.max(mean + real(2.0) * spread * wp.cos(angle), real(0.0)))
         unit = covariance / wp.max(scale, tiny)
         x = unit + cofactor(unit)
-        for _ in range(_NEWTON_STEPS):
+        step = int(0)  # a dynamic loop, so that it can stop where Newton has converged
+        while step < newton_steps:
+            step += 1
             adjugate = cofactor(x)
             det = x[0, 0] * adjugate[0, 0] + x[0, 1] * adjugate[0, 1] + x[0, 2] * adjugate[0, 2]
             if wp.abs(det) < real(1e-30):
                 det = real(1e-30)
             stretch = wp.sqrt(wp.sqrt(wp.ddot(adjugate, adjugate) / wp.ddot(x, x)) / wp.abs(det))
-            x = real(0.5) * (stretch * x + adjugate / (stretch * det))
+            following = real(0.5) * (stretch * x + adjugate / (stretch * det))
+            change = following - x
+            x = following
+            if wp.ddot(change, change) < converged:
+                break
         return x
 
     @wp.func_grad(nearest)
@@ -159,16 +167,18 @@ def _fit_backward(
     contiguous = torch.contiguous_format
     joints_grad = torch.zeros_like(joints, memory_format=contiguous)
     covariances_grad = torch.zeros_like(covariances, memory_format=contiguous)
+    grad = grad.clone(memory_format=contiguous)
+    scratch = torch.empty_like(grad)
     with launching(joints) as device:
         wp.launch(
             kernels.displace,
             dim=tuple(grad.shape[:2]),
             inputs=[as_warp(pivots), as_warp(children), as_warp(bind, kernels.vec3),
                     as_warp(joints, kernels.vec3), as_warp(covariances, kernels.mat33)],
-            outputs=[as_warp(torch.empty_like(grad, memory_format=contiguous), kernels.mat33)],
+            outputs=[as_warp(scratch, kernels.mat33)],
             adj_inputs=[None, None, None, as_warp(joints_grad, kernels.vec3),
                         as_warp(covariances_grad, kernels.mat33)],
-            adj_outputs=[as_warp(grad.clone(memory_format=contiguous), kernels.mat33)],
+            adj_outputs=[as_warp(grad, kernels.mat33)],
             adjoint=True,
             device=device,
         )  # fmt: skip
@@ -205,4 +215,4 @@ def fit_displacements(
         pivots: (p,) int64 joint ids.
         children: (p, width) int64 child ids of each pivot, at least two columns, padded with -1.
     """
-    return _fit(joints, covariances, bind, pivots, children)
+    return _fit(joints.contiguous(), covariances.contiguous(), bind, pivots, children)

@@ -102,6 +102,7 @@ def _skin_backward(
     kernels = _kernels(scalar_name(points.dtype))
     points_grad = torch.empty_like(points, memory_format=torch.contiguous_format)
     transforms_grad = torch.empty_like(transforms, memory_format=torch.contiguous_format)
+    grad = grad.contiguous()
     warp_grad = as_warp(grad, kernels.vec3)
     with launching(points) as device:
         wp.launch(
@@ -145,4 +146,4 @@ def skin(points: Tensor, transforms: Tensor, weights: Csr, transpose: Csr) -> Te
     `weights` (v, J) and `transpose` (J, v) are one matrix in CSR form. Reductions run in index order:
     forward and backward are deterministic. float32 and float64, CPU and CUDA.
     """
-    return _skin(points, transforms, *weights, *transpose)
+    return _skin(points.contiguous(), transforms.contiguous(), *weights, *transpose)
