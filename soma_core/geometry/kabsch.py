@@ -56,7 +56,17 @@ def _nearest_rotation(covariance: Tensor) -> Tensor:
         norm, inverse_norm = x.norm(dim=(-1, -2)), adjugate.norm(dim=(-1, -2)) / det.abs()
         stretch = (inverse_norm / norm).sqrt()
         x = 0.5 * (stretch[..., None, None] * x + adjugate / (stretch * det)[..., None, None])
-    return x
+    return torch.where(_is_rotation(x), x, torch.eye(3, dtype=x.dtype, device=x.device))
+
+
+def _is_rotation(x: Tensor) -> Tensor:
+    """Whether the iteration arrived, (..., 1, 1): it cannot where s2 + s s3 = 0 to the last digit.
+
+    The maximiser is then any of a family; a reflection exactly along the axes is the usual case.
+    """
+    adjugate = cofactor(x)
+    det = (x[..., 0, :] * adjugate[..., 0, :]).sum(-1)
+    return (((x - adjugate).abs().amax((-1, -2)) < 1e-3) & (det > 0))[..., None, None]
 
 
 class _NearestRotation(torch.autograd.Function):
@@ -95,8 +105,9 @@ def rotation_from_covariance(covariance: Tensor, *, reference: Tensor | None = N
     """Rotation R in SO(3) that maximises ``<R, H>`` for ``H = sum target source^T``; (..., 3, 3) each.
 
     A weak pull towards `reference` (identity by default), proportional to ``|H|``, decides clouds of
-    rank one or zero: H = 0 returns the reference. Differentiable; the derivative is exact wherever
-    the maximiser is unique. Paper, equation 5, in place of its SVD and equation 8.
+    rank one or zero: H = 0 returns the reference. Where even so no maximiser stands out, a rotation is
+    still returned. Differentiable; the derivative is exact wherever the maximiser is unique. Paper,
+    equation 5, in place of its SVD and equation 8.
     """
     if reference is None:
         reference = torch.eye(3, dtype=covariance.dtype, device=covariance.device)

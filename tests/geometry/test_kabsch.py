@@ -137,6 +137,19 @@ def test_scale_does_not_matter(exponent, dtype):
     torch.testing.assert_close(scaled, rotation_from_covariance(given), atol=300 * ORTHONORMAL[dtype], rtol=0)
 
 
+@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize(
+    "diagonal", [[-1, -1, -1], [-1, 0, 0], [0, -1, 0], [1, 1, -1], [-1, -1, 1], [1, -1, 0]]
+)
+def test_exact_ties_along_the_axes_still_give_a_rotation(diagonal, dtype):
+    """Round numbers meet s2 + s s3 = 0 exactly, where generic frames only come near."""
+    given = torch.diag(torch.tensor(diagonal, dtype=dtype)).requires_grad_()
+    found = rotation_from_covariance(given)
+    assert orthonormality_error(found) < 10 * ORTHONORMAL[dtype]
+    (grad,) = torch.autograd.grad(found.sum(), given)
+    assert grad.isfinite().all()
+
+
 def test_equivariant():
     given, left, right = randn(50, 3, 3, seed=13), frames(50, 14), frames(50, 15)
     found = rotation_from_covariance(left @ given @ right, reference=left @ right)
