@@ -12,7 +12,7 @@ PHENOTYPES = ("gender", "age", "muscle", "weight", "height", "proportions")
 
 
 def forward_inputs(joint_names: Sequence[str], batch: int, seed: int) -> dict[str, np.ndarray]:
-    """Poses (batch, 77, 3) [rad], translations (batch, 3) [m], shape (batch, 128) and phenotypes (batch, 6)."""
+    """Poses (batch, 77, 3) [rad], translations (batch, 3) [m], shape (batch, 128), phenotypes (batch, 6)."""
     from soma_core.evaluation.random_poses import random_axis_angles
 
     random = np.random.default_rng([seed, batch])

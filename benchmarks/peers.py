@@ -18,6 +18,9 @@ from pathlib import Path
 
 import numpy as np
 
+SEGMENTS = (
+    "head", "feet", "torso", "mouth_bag", "eye_bags", "between_toes", "hair", "haircap", "armpits",
+)  # fmt: skip
 PHENOTYPES = ("gender", "age", "muscle", "weight", "height", "proportions")
 
 
@@ -45,8 +48,7 @@ def build(folder: Path) -> None:
     bind, pose = centimetres(rig.bind_world), centimetres(rig.t_pose_world)
     columns = rig.weights.tocsc()
     empty = np.zeros(0, np.int32)
-    segments = {f"segment_{name}": mesh.segments.get(name, empty) for name in (
-        "head", "feet", "torso", "mouth_bag", "eye_bags", "between_toes", "hair", "haircap", "armpits")}  # fmt: skip
+    segments = {f"segment_{name}": mesh.segments.get(name, empty) for name in SEGMENTS}
     folder.mkdir(parents=True, exist_ok=True)
     np.savez(
         folder / "SOMA_neutral.npz",
@@ -98,7 +100,9 @@ def serve_py_soma_x(folder: str, backend: str) -> None:
         if case == "pose":
             with torch.no_grad():
                 layer.prepare_identity(given[:1], scales, repose_to_bind_pose=False)
-            return torch.no_grad()(lambda: layer.pose(poses, transl=shift, apply_correctives=False)["vertices"])
+            return torch.no_grad()(
+                lambda: layer.pose(poses, transl=shift, apply_correctives=False)["vertices"]
+            )
         tracked = [tensor.requires_grad_() for tensor in (poses, shift, given)]
 
         def both():

@@ -1,6 +1,8 @@
 """Time the forward path against its peers: correctness first, then alternating rounds, then the tables.
 
-    python -m venv peer && peer/bin/pip install torch==2.13.0 && peer/bin/pip install py-soma-x==0.1.0 anny==0.6.2
+    python -m venv peer
+    peer/bin/pip install torch==2.13.0
+    peer/bin/pip install py-soma-x==0.1.0 anny==0.6.2
     python benchmarks/run.py --peer-python peer/bin/python
 
 Writes ``benchmarks/results/forward_cpu.json`` and the tables in ``benchmarks/README.md`` and ``README.md``.
@@ -26,12 +28,14 @@ HERE = Path(__file__).resolve().parent
 ROOT = HERE.parent
 MARKS = ("<!-- benchmarks:begin -->", "<!-- benchmarks:end -->")
 SAME_MM = {"soma": 5.0, "anny": 5.0}
-"""Largest mean distance to the peer [mm] at which the work counts as the same. Different frames of joints with
-several children, and our reposing to the bind pose, account for about one (``soma evaluate anny_reference``)."""
+"""Largest mean distance to the peer [mm] at which the work counts as the same. Different frames of joints
+with several children, and our reposing to the bind pose, account for about one (see the experiment
+``anny_reference``)."""
 CASES = [("forward", 1), ("forward", 8), ("forward", 32), ("forward", 128), ("pose", 32), ("pose", 128),
          ("forward_backward", 8)]  # fmt: skip
 BARS = {
-    ("soma", "forward", 32): 3, ("soma", "forward", 128): 3, ("anny", "forward", 32): 5, ("anny", "forward", 128): 5,
+    ("soma", "forward", 32): 3, ("soma", "forward", 128): 3,
+    ("anny", "forward", 32): 5, ("anny", "forward", 128): 5,
     ("soma", "pose", 32): 4, ("soma", "pose", 128): 4, ("anny", "pose", 32): 4, ("anny", "pose", 128): 4,
     ("soma", "forward_backward", 8): 2, ("anny", "forward_backward", 8): 2,
 }  # fmt: skip
@@ -42,7 +46,9 @@ class Worker:
 
     def __init__(self, name: str, command: Sequence[str]) -> None:
         self.name = name
-        self.process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, cwd=HERE)
+        self.process = subprocess.Popen(
+            command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, cwd=HERE
+        )
         self.versions = self._read()["versions"]
         self.peak_mb = 0.0
 
@@ -76,11 +82,15 @@ def compare(ours: Worker, peer: Worker, inputs: str, folder: Path, *, limit_mm: 
         first, second = (body - body.mean(1, keepdims=True) for body in bodies)
     distance = 1e3 * float(np.linalg.norm(first - second, axis=-1).mean())
     if not distance <= limit_mm:
-        raise SystemExit(f"{ours.name} and {peer.name} are {distance:.1f} mm apart: not the same work, not timed")
+        raise SystemExit(
+            f"{ours.name} and {peer.name} are {distance:.1f} mm apart: not the same work, not timed"
+        )
     return distance
 
 
-def measure(workers: list[Worker], case: str, inputs: str, *, rounds: int, seconds: float) -> dict[str, list[float]]:
+def measure(
+    workers: list[Worker], case: str, inputs: str, *, rounds: int, seconds: float
+) -> dict[str, list[float]]:
     """Median milliseconds of each round, workers taking turns."""
     found: dict[str, list[float]] = {worker.name: [] for worker in workers}
     for _ in range(rounds):
@@ -99,7 +109,10 @@ def run_backend(backend: str, options: argparse.Namespace, folder: Path, joint_n
     ours = Worker("ours", [here, "ours.py", backend])
     peer = Worker("peer", [peer_python, "peers.py", "py-soma-x", str(folder / "assets"), backend])
     package = Worker("package", [here, "peers.py", "anny"]) if backend == "anny" else None
-    result = {"versions": {worker.name: worker.versions for worker in (ours, peer, package) if worker}, "rows": []}
+    result = {
+        "versions": {worker.name: worker.versions for worker in (ours, peer, package) if worker},
+        "rows": [],
+    }
     result["mean_distance_mm"] = compare(ours, peer, files[8], folder, limit_mm=SAME_MM[backend], hips=False)
     if package:
         result["mean_distance_to_package_mm"] = compare(
@@ -108,7 +121,11 @@ def run_backend(backend: str, options: argparse.Namespace, folder: Path, joint_n
     for case, batch in CASES:
         workers = [ours, peer] + ([package] if package and case == "forward" else [])
         times = measure(workers, case, files[batch], rounds=options.rounds, seconds=options.seconds)
-        row = {"case": case, "batch": batch, "ms": {name: statistics.median(values) for name, values in times.items()}}
+        row = {
+            "case": case,
+            "batch": batch,
+            "ms": {name: statistics.median(values) for name, values in times.items()},
+        }
         for name in times:
             if name != "ours":
                 ratios = [theirs / mine for theirs, mine in zip(times[name], times["ours"], strict=True)]
@@ -141,7 +158,8 @@ def table(results: dict) -> str:
         peak, versions = result["peak_mb"], result["versions"]
         lines.append(
             f"{backend}: peak memory {peak['ours']:.0f} MB against {peak['peer']:.0f} MB; construction "
-            f"{versions['ours']['construction_s']} s; mean distance of the two results {result['mean_distance_mm']:.2f} mm."
+            f"{versions['ours']['construction_s']} s; "
+            f"mean distance of the two results {result['mean_distance_mm']:.2f} mm."
         )
     machine = results["machine"]
     lines += ["", f"{machine['cpu']}, 2 threads, float32, medians of {machine['rounds']} alternating rounds; "
@@ -160,16 +178,23 @@ def insert(path: Path, text: str) -> None:
 
 
 def machine(options: argparse.Namespace, backends: dict) -> dict:
-    names = [line.split(":")[1].strip() for line in Path("/proc/cpuinfo").read_text().splitlines() if "model name" in line]
+    names = [
+        line.split(":")[1].strip()
+        for line in Path("/proc/cpuinfo").read_text().splitlines()
+        if "model name" in line
+    ]
     commit = subprocess.run(["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True, cwd=ROOT)
     versions = next(iter(backends.values()))["versions"]
-    return {"cpu": names[0] if names else platform.processor(), "rounds": options.rounds, "seed": options.seed,
+    cpu = names[0] if names else platform.processor()
+    return {"cpu": cpu, "rounds": options.rounds, "seed": options.seed,
             "torch": versions["ours"]["torch"], "peer": versions["peer"]["py-soma-x"],
             "commit": commit.stdout.strip()}  # fmt: skip
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--peer-python", required=True, help="interpreter with py-soma-x installed")
     parser.add_argument("--backends", nargs="+", default=["soma", "anny"])
     parser.add_argument("--rounds", type=int, default=5)

@@ -17,11 +17,17 @@ _ROTATION_TOLERANCE = 1e-2
 def _check_kind(name: str, value: object, dtype: torch.dtype, device: torch.device) -> None:
     if not isinstance(value, Tensor):
         raise InputError(
-            name, got=type(value).__name__, expected="a torch.Tensor", fix=f"Wrap it: torch.as_tensor({name})."
+            name,
+            got=type(value).__name__,
+            expected="a torch.Tensor",
+            fix=f"Wrap it: torch.as_tensor({name}).",
         )
     if value.dtype != dtype:
         raise InputError(
-            name, got=value.dtype, expected=dtype, fix=f"Call {name}.to({dtype}) or build the layer with its dtype."
+            name,
+            got=value.dtype,
+            expected=dtype,
+            fix=f"Call {name}.to({dtype}) or build the layer with its dtype.",
         )
     if value.device.type != device.type or (device.index is not None and value.device != device):
         raise InputError(name, got=value.device, expected=device, fix=f"Call {name}.to({str(device)!r}).")

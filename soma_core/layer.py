@@ -91,7 +91,7 @@ class SomaLayer(torch.nn.Module):
         )  # fmt: skip
         self.animation = Animation(self.rig, device=device, dtype=dtype, kernels=self.kernels)
 
-    def _apply(self, fn, recurse=True):
+    def _apply(self, fn, recurse=True):  # noqa: ARG002 - PyTorch's signature
         """Rebuild for the new device or dtype: constants are derived in float64, never cast twice."""
         probe = fn(torch.empty(0, dtype=self.dtype, device=self.device))
         if (probe.device, probe.dtype) != (self.device, self.dtype):
@@ -150,7 +150,9 @@ class SomaLayer(torch.nn.Module):
         Raises:
             InputError: a wrong shape, dtype or device, a NaN, a matrix that is no rotation.
         """
-        relative = check_rotations(rotations, len(self.joint_names), self.dtype, self.device, validate=self.validate)
+        relative = check_rotations(
+            rotations, len(self.joint_names), self.dtype, self.device, validate=self.validate
+        )
         batch = _common_batch(identity.batch_size, len(relative))
         shift = check_translation(translation, batch, self.dtype, self.device, validate=self.validate)
         relative = relative.expand(batch, *relative.shape[1:])
@@ -169,7 +171,9 @@ class SomaLayer(torch.nn.Module):
         Without gradients a large batch runs through in chunks that stay in cache.
         """
         batch = batch_parameters(self.spec, params, device=self.device, dtype=self.dtype)
-        relative = check_rotations(rotations, len(self.joint_names), self.dtype, self.device, validate=self.validate)
+        relative = check_rotations(
+            rotations, len(self.joint_names), self.dtype, self.device, validate=self.validate
+        )
         identities = len(next(iter(batch.values()), relative))
         size = _common_batch(identities, len(relative))
         shift = check_translation(translation, size, self.dtype, self.device, validate=self.validate)

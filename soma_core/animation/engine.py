@@ -16,6 +16,7 @@ from soma_core.skeleton.identity import Identity
 
 __all__ = ["Animation"]
 
+
 class Animation(torch.nn.Module):
     """Forward kinematics and skinning of one rig at one LOD.
 

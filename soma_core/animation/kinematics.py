@@ -62,7 +62,9 @@ class Kinematics(torch.nn.Module):
         warp: run the Warp twin instead of the torch reference.
     """
 
-    def __init__(self, rig: Rig, *, dtype: torch.dtype, device: torch.device | str, warp: bool = False) -> None:
+    def __init__(
+        self, rig: Rig, *, dtype: torch.dtype, device: torch.device | str, warp: bool = False
+    ) -> None:
         super().__init__()
         self.warp, self.joint_count = warp, rig.joint_count
         parents = np.maximum(rig.parents, 0)

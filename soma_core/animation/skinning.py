@@ -18,7 +18,7 @@ _CHUNK = 32
 
 
 def skinning_transforms(rotations: Tensor, positions: Tensor, bind_world: Tensor) -> Tensor:
-    """``G B^-1`` as (B, J, 3, 4), from posed rotations, positions [m] and bind transforms (B or 1, J, 4, 4)."""
+    """``G B^-1`` (B, J, 3, 4) from posed rotations, positions [m] and bind transforms (B or 1, J, 4, 4)."""
     bind_rotation, bind_position = bind_world[..., :3, :3], bind_world[..., :3, 3]
     turn = rotations @ bind_rotation.transpose(-1, -2)
     shift = positions - (turn @ bind_position[..., None]).squeeze(-1)
@@ -57,14 +57,14 @@ class _Blend(torch.autograd.Function):
     """
 
     @staticmethod
-    def forward(points, planes, rows, crow, col, val, t_crow, t_col, t_val):
+    def forward(points, planes, rows, crow, col, val, *_transpose):
         count, batch = len(crow) - 1, planes.shape[3]
         out = planes.new_empty((batch, count, 3) if rows else (3, count, batch))
         _blend_into(out, points, planes, (crow, col, val), rows=rows)
         return out
 
     @staticmethod
-    def setup_context(ctx, inputs, output) -> None:
+    def setup_context(ctx, inputs, output) -> None:  # noqa: ARG004 - PyTorch calls it by position
         points, planes, rows, *matrix = inputs
         ctx.rows = rows
         ctx.save_for_backward(points, planes, *matrix)
@@ -100,18 +100,24 @@ class Skinning(torch.nn.Module):
     and every elementwise step runs over contiguous memory.
     """
 
-    def __init__(self, weights: scipy.sparse.csr_array, *, dtype: torch.dtype, device: torch.device | str) -> None:
+    def __init__(
+        self, weights: scipy.sparse.csr_array, *, dtype: torch.dtype, device: torch.device | str
+    ) -> None:
         super().__init__()
         self.weights = SparseRows(weights, dtype=dtype, device=device)
         weights = weights.sorted_indices()
         vertices, joints = weights.shape
         columns = (4 * weights.indices.astype(np.int64)[:, None] + np.arange(4)).ravel()
         starts = 4 * weights.indptr.astype(np.int64)
-        order = scipy.sparse.csr_array((np.arange(len(columns)), columns, starts), shape=(vertices, 4 * joints))
+        order = scipy.sparse.csr_array(
+            (np.arange(len(columns)), columns, starts), shape=(vertices, 4 * joints)
+        )
         turned = order.T.tocsr()
 
         def keep(name: str, array: np.ndarray) -> None:
-            self.register_buffer(name, torch.as_tensor(array, dtype=torch.int64, device=device), persistent=False)
+            self.register_buffer(
+                name, torch.as_tensor(array, dtype=torch.int64, device=device), persistent=False
+            )
 
         keep("point_col", columns)
         keep("point_crow", starts)

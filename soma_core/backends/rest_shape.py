@@ -1,4 +1,4 @@
-"""From parameters to a canonical rest shape and its fitted skeleton: exact or composed (paper, 3.2 to 3.4)."""
+"""From parameters to a canonical rest shape and its fitted skeleton, (paper, 3.2 to 3.4)."""
 
 from __future__ import annotations
 
@@ -44,7 +44,11 @@ class ComposedRestShape(torch.nn.Module):
     """
 
     def __init__(
-        self, linear: LinearBasis, transfer: TopologyTransfer | CanonicalPassThrough, fit: SkeletonFit, at: Tensor
+        self,
+        linear: LinearBasis,
+        transfer: TopologyTransfer | CanonicalPassThrough,
+        fit: SkeletonFit,
+        at: Tensor,
     ) -> None:
         super().__init__()
         self.coefficients, self.fit = linear.coefficients, fit

@@ -2,7 +2,8 @@
 
 What remains has three parts, each measured by taking our path and swapping one stage for theirs: the
 frames of joints with several children (theirs add the normal of the first two children to the Procrustes
-problem, ours those of every pair, so that left and right are treated alike), their topology transfer without normal offsets, and our reposing to the bind pose before skinning.
+problem, ours those of every pair, so that left and right are treated alike), their topology transfer
+without normal offsets, and our reposing to the bind pose before skinning.
 """
 
 from __future__ import annotations
@@ -31,12 +32,16 @@ _PHENOTYPES = ("gender", "age", "muscle", "weight", "height", "proportions")
 _MEAN_MM = 1.0
 _EXPLAINED_MM = 0.01
 
+
 def _package_model() -> Any:
     try:
         import anny
     except ImportError as error:
         raise InputError(
-            "experiment.backend", got="no anny package", expected="the anny package", fix="pip install anny==0.6.2"
+            "experiment.backend",
+            got="no anny package",
+            expected="the anny package",
+            fix="pip install anny==0.6.2",
         ) from error
     model = anny.Anny(rig="soma", topology="soma", phenotypes="all", pose_parameterization="local-ref")
     return model.to(torch.float64)
@@ -47,7 +52,7 @@ def _from_hips(points: Tensor, transforms: Tensor) -> Tensor:
     return points - transforms[:, 1:2, :3, 3]
 
 
-def _their_identity(layer: SomaLayer, identity: Identity, found: dict[str, Tensor], rest: Tensor) -> Identity:
+def _their_identity(identity: Identity, found: dict[str, Tensor], rest: Tensor) -> Identity:
     """Our identity with the package's rest frames, and `rest` vertices."""
     to_canonical = torch.tensor([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]], dtype=torch.float64)
     frames = found["rest_bone_poses"]
@@ -82,23 +87,33 @@ def run(config: DictConfig) -> Report:
     their_rest = found["rest_vertices"] @ to_canonical.T
     offset = identity.fitted_rest - their_rest
     offset = (offset - offset.mean(1, keepdim=True)).norm(dim=-1)
-    their_frames = _their_identity(layer, identity, found, identity.fitted_rest)
-    aligned = _their_identity(layer, identity, found, their_rest)
+    their_frames = _their_identity(identity, found, identity.fitted_rest)
+    aligned = _their_identity(identity, found, their_rest)
     figures = [
         *distance_figures("posed vertices", distances(identity), mean=_MEAN_MM),
         Figure(name="without reposing, mean", value=1e3 * distances(as_fitted).mean(), unit="mm"),
-        Figure(name="rest vertices (their transfer has no normal offset), mean", value=1e3 * float(offset.mean()),
-               unit="mm"),
-        Figure(name="our rest vertices on their rest frames, mean", value=1e3 * distances(their_frames).mean(),
-               unit="mm"),
-        Figure(name="their rest vertices on their rest frames, mean", value=1e3 * distances(aligned).mean(), unit="mm",
-               bound=_EXPLAINED_MM),
-    ]  # fmt: skip
+        Figure(
+            name="rest vertices (their transfer has no normal offset), mean",
+            value=1e3 * float(offset.mean()),
+            unit="mm",
+        ),
+        Figure(
+            name="our rest vertices on their rest frames, mean",
+            value=1e3 * distances(their_frames).mean(),
+            unit="mm",
+        ),
+        Figure(
+            name="their rest vertices on their rest frames, mean",
+            value=1e3 * distances(aligned).mean(),
+            unit="mm",
+            bound=_EXPLAINED_MM,
+        ),
+    ]
     return Report(
         title=f"Against the anny package's own SOMA rig: {count} random identities and poses",
         figures=figures,
         notes=(
-            "Distances are relative to the Hips. The last line runs our kinematics and skinning on the package's rest "
-            "shape and frames: what is left there would be a difference in section 3.5.1.",
+            "Distances are relative to the Hips. The last line runs our kinematics and skinning on the "
+            "package's rest shape and frames: what is left there would be a difference in section 3.5.1.",
         ),
     )

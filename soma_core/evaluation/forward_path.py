@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import warnings
 from pathlib import Path
 
 import numpy as np
@@ -20,7 +21,7 @@ from soma_core.shape_space.sampling import sample_parameters
 from soma_core.skeleton.fit import SkeletonFit
 from soma_core.skeleton.joints import joint_regressor
 from soma_core.topology.correspondence import load_correspondence
-from soma_core.topology.fill import build_fill, FillOperator
+from soma_core.topology.fill import FillOperator, build_fill
 from soma_core.topology.transfer import make_transfer
 
 __all__ = ["run"]
@@ -51,7 +52,11 @@ def _package_regressor() -> scipy.sparse.csr_array | None:
     if spec is None or not spec.submodule_search_locations:
         return None
     path = Path(spec.submodule_search_locations[0]) / "data" / "soma" / "soma_rig.pt"
-    dense = torch.load(path, weights_only=True)["sparse_rbf_matrix"].to_dense()
+    with warnings.catch_warnings():
+        warnings.filterwarnings(
+            "ignore", message="Sparse CSR tensor support is in beta", category=UserWarning
+        )
+        dense = torch.load(path, weights_only=True)["sparse_rbf_matrix"].to_dense()
     return scipy.sparse.csr_array(dense.double().numpy())
 
 
@@ -59,12 +64,19 @@ def _joint_figures(layer: SomaLayer, rest: np.ndarray) -> list[Figure]:
     mesh, rig = layer.mesh, layer.rig
     ours = joint_regressor(mesh, rig)
     at_bind = np.abs(ours @ rig.bind_shape - rig.bind_world[:, :3, 3])[1:].max()
-    figures = [Figure(name="joints at the bind shape against the rig", value=1e3 * at_bind, unit="mm", bound=1e-4)]
+    figures = [
+        Figure(name="joints at the bind shape against the rig", value=1e3 * at_bind, unit="mm", bound=1e-4)
+    ]
     theirs = _package_regressor()
     if theirs is not None:
         difference = max(np.abs(ours @ body - theirs @ body)[1:].max() for body in rest)
         figures.append(
-            Figure(name="joints against the anny package's regressor", value=1e3 * difference, unit="mm", bound=1e-3)
+            Figure(
+                name="joints against the anny package's regressor",
+                value=1e3 * difference,
+                unit="mm",
+                bound=1e-3,
+            )
         )
     return figures
 
@@ -94,7 +106,12 @@ def run(config: DictConfig) -> Report:
             value=float(orthonormality_error(single_identity.fitted_world[..., :3, :3].double()).max()),
             bound=1e-6,
         ),
-        Figure(name="joints fitted again to the reposed body", value=1e3 * float(refit[..., :3, 3].norm(dim=-1).mean()),
-               unit="mm"),
-    ]  # fmt: skip
-    return Report(title=f"Forward path on {config.experiment.count} identities of {layer.backend}", figures=figures)
+        Figure(
+            name="joints fitted again to the reposed body",
+            value=1e3 * float(refit[..., :3, 3].norm(dim=-1).mean()),
+            unit="mm",
+        ),
+    ]
+    return Report(
+        title=f"Forward path on {config.experiment.count} identities of {layer.backend}", figures=figures
+    )

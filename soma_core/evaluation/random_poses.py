@@ -33,7 +33,9 @@ _LONGEST = 1.6
 
 def joint_spread(names: Sequence[str]) -> np.ndarray:
     """Standard deviation [rad] of each joint's rotation vector, (J,)."""
-    found = [next((spread for pattern, spread in _SPREAD if re.fullmatch(pattern, name)), 0.0) for name in names]
+    found = [
+        next((spread for pattern, spread in _SPREAD if re.fullmatch(pattern, name)), 0.0) for name in names
+    ]
     return np.array(found)
 
 

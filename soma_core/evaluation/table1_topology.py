@@ -14,9 +14,9 @@ from soma_core.geometry.barycentric import closest_point_on_triangle
 from soma_core.layer import SomaLayer
 from soma_core.plugin.registry import default_registry
 from soma_core.plugin.spec import BackendSpec
+from soma_core.progress import progress
 from soma_core.rig.mesh import CanonicalMesh
 from soma_core.shape_space.sampling import sample_parameters
-from soma_core.progress import progress
 from soma_core.topology.closest import ClosestFaces
 from soma_core.topology.correspondence import Correspondence, load_correspondence
 from soma_core.topology.frames import METRES, native_to_canonical
@@ -50,7 +50,9 @@ def _identities(spec: BackendSpec, count: int, seed: int) -> Iterable[dict[str, 
         yield {name: torch.as_tensor(value[index : index + 1]).float() for name, value in drawn.items()}
 
 
-def _transfer_distances(layer: SomaLayer, correspondence: Correspondence, count: int, seed: int) -> np.ndarray:
+def _transfer_distances(
+    layer: SomaLayer, correspondence: Correspondence, count: int, seed: int
+) -> np.ndarray:
     generator = default_registry().generator(layer.backend, device=layer.device, dtype=layer.dtype)
     measured = _measured_vertices(layer.mesh)
     found = []
@@ -76,10 +78,12 @@ def _canonical_difference(layer: SomaLayer, count: int, seed: int) -> float:
 
 @torch.no_grad()
 def run(config: DictConfig) -> Report:
-    """Measure `config.experiment.count` random identities of `config.experiment.backend`, and the native one."""
+    """Measure random identities (`config.experiment.count`) of a backend, and of the native one."""
     name, count, seed = config.experiment.backend, config.experiment.count, config.seed
     native = SomaLayer("soma", exact=True)
-    figures = [Figure(name="soma, max", value=1e3 * _canonical_difference(native, 4, seed), unit="mm", bound=0.0)]
+    figures = [
+        Figure(name="soma, max", value=1e3 * _canonical_difference(native, 4, seed), unit="mm", bound=0.0)
+    ]
     layer = SomaLayer(name)
     if layer.spec.wrap is not None:
         correspondence = load_correspondence(layer.spec.wrap, layer.mesh)

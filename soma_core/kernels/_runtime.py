@@ -5,6 +5,8 @@ from __future__ import annotations
 import contextlib
 import functools
 import logging
+import os
+import sys
 from collections.abc import Iterator
 from typing import Any
 
@@ -26,15 +28,36 @@ def start() -> None:
     wp.config.quiet = True
     if hasattr(wp, "LOG_ERROR"):
         wp.config.log_level = wp.LOG_ERROR
-    wp.init()
+    if torch.cuda.is_available():
+        wp.init()
+    else:
+        with _native_stderr_closed():
+            wp.init()
     _log.debug("Warp %s ready", wp.config.version)
+
+
+@contextlib.contextmanager
+def _native_stderr_closed() -> Iterator[None]:
+    """Drop what native code writes to stderr: Warp 1.19 warns of a missing GPU there, past its own log level."""
+    sys.stderr.flush()
+    saved, sink = os.dup(2), os.open(os.devnull, os.O_WRONLY)
+    try:
+        os.dup2(sink, 2)
+        yield
+    finally:
+        os.dup2(saved, 2)
+        os.close(saved)
+        os.close(sink)
 
 
 def scalar_name(dtype: torch.dtype) -> str:
     """``float32`` or ``float64``: the key of a kernel family."""
     if dtype not in _SCALARS:
         raise InputError(
-            "dtype", got=dtype, expected="torch.float32 or torch.float64", fix="Convert, or use kernels='torch'."
+            "dtype",
+            got=dtype,
+            expected="torch.float32 or torch.float64",
+            fix="Convert, or use kernels='torch'.",
         )
     return str(dtype).removeprefix("torch.")
 

@@ -57,7 +57,9 @@ def _walk(relative: Tensor, offsets: Tensor, order: Tensor, parents: Tensor) -> 
 @_walk.register_fake
 def _(relative, offsets, order, parents):
     contiguous = torch.contiguous_format
-    return torch.empty_like(relative, memory_format=contiguous), torch.empty_like(offsets, memory_format=contiguous)
+    return torch.empty_like(relative, memory_format=contiguous), torch.empty_like(
+        offsets, memory_format=contiguous
+    )
 
 
 @torch.library.custom_op("soma_core::forward_kinematics_backward", mutates_args=())
@@ -96,14 +98,18 @@ def _save(ctx, inputs, output) -> None:
 
 
 def _backward(ctx, turns_grad, positions_grad):
-    gradients = torch.ops.soma_core.forward_kinematics_backward(turns_grad, positions_grad, *ctx.saved_tensors)
+    gradients = torch.ops.soma_core.forward_kinematics_backward(
+        turns_grad, positions_grad, *ctx.saved_tensors
+    )
     return *gradients, None, None
 
 
 _walk.register_autograd(_backward, setup_context=_save)
 
 
-def forward_kinematics(relative: Tensor, offsets: Tensor, order: Tensor, parents: Tensor) -> tuple[Tensor, Tensor]:
+def forward_kinematics(
+    relative: Tensor, offsets: Tensor, order: Tensor, parents: Tensor
+) -> tuple[Tensor, Tensor]:
     """Accumulated turns (B, J, 3, 3) and world positions (B, J, 3) [m] down the joint tree.
 
     Args:

@@ -27,7 +27,11 @@ def _rotation_functions(scalar: str, module: wp.Module) -> SimpleNamespace:
 
     @wp.func(module=module)
     def cofactor(m: mat33):
-        a, b, c = vec3(m[0, 0], m[0, 1], m[0, 2]), vec3(m[1, 0], m[1, 1], m[1, 2]), vec3(m[2, 0], m[2, 1], m[2, 2])
+        a, b, c = (
+            vec3(m[0, 0], m[0, 1], m[0, 2]),
+            vec3(m[1, 0], m[1, 1], m[1, 2]),
+            vec3(m[2, 0], m[2, 1], m[2, 2]),
+        )
         return wp.matrix_from_rows(wp.cross(b, c), wp.cross(c, a), wp.cross(a, b))
 
     @wp.func(module=module)
@@ -41,7 +45,7 @@ def _rotation_functions(scalar: str, module: wp.Module) -> SimpleNamespace:
         scale = wp.sqrt(wp.max(mean + real(2.0) * spread * wp.cos(angle), real(0.0)))
         unit = covariance / wp.max(scale, tiny)
         x = unit + cofactor(unit)
-        step = int(0)  # a dynamic loop, so that it can stop where Newton has converged
+        step = int(0)  # noqa: UP018, RUF046 - a dynamic variable to Warp, so that the loop can end early
         while step < newton_steps:
             step += 1
             adjugate = cofactor(x)
@@ -188,7 +192,9 @@ def _fit_backward(
 @_fit_backward.register_fake
 def _(grad, joints, covariances, bind, pivots, children):
     contiguous = torch.contiguous_format
-    return torch.empty_like(joints, memory_format=contiguous), torch.empty_like(covariances, memory_format=contiguous)
+    return torch.empty_like(joints, memory_format=contiguous), torch.empty_like(
+        covariances, memory_format=contiguous
+    )
 
 
 def _save(ctx, inputs, output) -> None:

@@ -45,7 +45,9 @@ def _kernels(scalar: str) -> SimpleNamespace:
         total = vec4()
         for e in range(wp.int32(crow[v]), wp.int32(crow[v + 1])):
             w, j = val[e], wp.int32(col[e])
-            total += w * (g[0] * transforms[b, j, 0] + g[1] * transforms[b, j, 1] + g[2] * transforms[b, j, 2])
+            total += w * (
+                g[0] * transforms[b, j, 0] + g[1] * transforms[b, j, 1] + g[2] * transforms[b, j, 2]
+            )
         out[b, v] = vec3(total[0], total[1], total[2])
 
     @wp.kernel(module=module, enable_backward=False)
@@ -77,7 +79,10 @@ def _skin(
     points: Tensor, transforms: Tensor, crow: Tensor, col: Tensor, val: Tensor,
     t_crow: Tensor, t_col: Tensor, t_val: Tensor,
 ) -> Tensor:  # fmt: skip
-    kernels, out = _kernels(scalar_name(points.dtype)), torch.empty_like(points, memory_format=torch.contiguous_format)
+    kernels, out = (
+        _kernels(scalar_name(points.dtype)),
+        torch.empty_like(points, memory_format=torch.contiguous_format),
+    )
     with launching(points) as device:
         wp.launch(
             kernels.forward,
@@ -125,7 +130,9 @@ def _skin_backward(
 @_skin_backward.register_fake
 def _(grad, points, transforms, crow, col, val, t_crow, t_col, t_val):
     contiguous = torch.contiguous_format
-    return torch.empty_like(points, memory_format=contiguous), torch.empty_like(transforms, memory_format=contiguous)
+    return torch.empty_like(points, memory_format=contiguous), torch.empty_like(
+        transforms, memory_format=contiguous
+    )
 
 
 def _save(ctx, inputs, output) -> None:

@@ -31,7 +31,10 @@ def run(config: DictConfig, output: Path) -> None:
     name = config.experiment.name
     if name not in EXPERIMENTS:
         raise InputError(
-            "experiment.name", got=repr(name), expected="one of " + ", ".join(EXPERIMENTS), fix="Correct the name."
+            "experiment.name",
+            got=repr(name),
+            expected="one of " + ", ".join(EXPERIMENTS),
+            fix="Correct the name.",
         )
     report: Report = importlib.import_module(f"soma_core.evaluation.{name}").run(config)
     text = report.as_markdown()
