@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 import scipy.sparse
@@ -26,7 +26,8 @@ def skinning_transforms(rotations: Tensor, positions: Tensor, bind_world: Tensor
 
 
 def _chunks(batch: int) -> Iterator[slice]:
-    return (slice(start, min(start + _CHUNK, batch)) for start in range(0, batch, _CHUNK))
+    starts = range(0, batch, _CHUNK) or (0,)  # an empty batch is one empty chunk
+    return (slice(start, min(start + _CHUNK, batch)) for start in starts)
 
 
 def _part(points: Tensor, chunk: slice) -> Tensor:
@@ -50,47 +51,67 @@ def _blend_into(out: Tensor, points: Tensor, planes: Tensor, weights: Csr, *, ro
             out[chunk] = target.permute(2, 1, 0)
 
 
-class _Blend(torch.autograd.Function):
-    """Blend, apply and lay out, one chunk of poses at a time, with a backward pass that keeps nothing.
+# Operators of their own, so that torch.compile takes them whole: chunks, strided outputs and all.
+@torch.library.custom_op("soma_core::blend", mutates_args=())
+def _blend(points: Tensor, planes: Tensor, rows: bool, matrix: Sequence[Tensor]) -> Tensor:
+    """Blend, apply and lay out, one chunk of poses at a time; `matrix` is weights, then their transpose."""
+    count, batch = len(matrix[0]) - 1, planes.shape[3]
+    out = planes.new_empty((batch, count, 3) if rows else (3, count, batch))
+    _blend_into(out, points, planes, (matrix[0], matrix[1], matrix[2]), rows=rows)
+    return out
 
-    Only inputs are saved: blending again costs less than reading blended matrices back from memory.
-    """
 
-    @staticmethod
-    def forward(points, planes, rows, crow, col, val, *_transpose):
-        count, batch = len(crow) - 1, planes.shape[3]
-        out = planes.new_empty((batch, count, 3) if rows else (3, count, batch))
-        _blend_into(out, points, planes, (crow, col, val), rows=rows)
-        return out
+@_blend.register_fake
+def _(_points, planes, rows, matrix):
+    count, batch = matrix[0].shape[0] - 1, planes.shape[3]
+    return planes.new_empty((batch, count, 3) if rows else (3, count, batch))
 
-    @staticmethod
-    def setup_context(ctx, inputs, output) -> None:  # noqa: ARG004 - PyTorch calls it by position
-        points, planes, rows, *matrix = inputs
-        ctx.rows = rows
-        ctx.save_for_backward(points, planes, *matrix)
 
-    @staticmethod
-    def backward(ctx, grad):
-        points, planes, crow, col, val, t_crow, t_col, t_val = ctx.saved_tensors
-        weights, transpose = (crow, col, val), (t_crow, t_col, t_val)
-        points_grad = torch.zeros_like(points, memory_format=torch.contiguous_format)
-        planes_grad = torch.empty_like(planes, memory_format=torch.contiguous_format)
-        for chunk in _chunks(planes.shape[3]):
-            local, plane = _part(points, chunk), planes[..., chunk].contiguous()
-            g = (grad[chunk].permute(2, 1, 0) if ctx.rows else grad[:, :, chunk]).contiguous()
-            for row in range(3):
-                for axis in range(3):
-                    planes_grad[row, axis, :, chunk] = sparse_product(transpose, g[row] * local[axis])
-                planes_grad[row, 3, :, chunk] = sparse_product(transpose, g[row])
+@torch.library.custom_op("soma_core::blend_backward", mutates_args=())
+def _blend_backward(
+    grad: Tensor, points: Tensor, planes: Tensor, rows: bool, matrix: Sequence[Tensor]
+) -> tuple[Tensor, Tensor]:
+    """Gradients of points and planes; blending again costs less than reading blended matrices back."""
+    crow, col, val, t_crow, t_col, t_val = matrix
+    weights, transpose = (crow, col, val), (t_crow, t_col, t_val)
+    points_grad = torch.zeros_like(points, memory_format=torch.contiguous_format)
+    planes_grad = torch.empty_like(planes, memory_format=torch.contiguous_format)
+    for chunk in _chunks(planes.shape[3]):
+        local, plane = _part(points, chunk), planes[..., chunk].contiguous()
+        g = (grad[chunk].permute(2, 1, 0) if rows else grad[:, :, chunk]).contiguous()
+        for row in range(3):
             for axis in range(3):
-                total = sparse_product(weights, plane[0, axis]).mul_(g[0])
-                total.addcmul_(sparse_product(weights, plane[1, axis]), g[1])
-                total.addcmul_(sparse_product(weights, plane[2, axis]), g[2])
-                if points.shape[2] == 1:
-                    points_grad[axis, :, 0] += total.sum(1)
-                else:
-                    points_grad[axis, :, chunk] = total
-        return points_grad, planes_grad, None, None, None, None, None, None, None
+                planes_grad[row, axis, :, chunk] = sparse_product(transpose, g[row] * local[axis])
+            planes_grad[row, 3, :, chunk] = sparse_product(transpose, g[row])
+        for axis in range(3):
+            total = sparse_product(weights, plane[0, axis]).mul_(g[0])
+            total.addcmul_(sparse_product(weights, plane[1, axis]), g[1])
+            total.addcmul_(sparse_product(weights, plane[2, axis]), g[2])
+            if points.shape[2] == 1:
+                points_grad[axis, :, 0] += total.sum(1)
+            else:
+                points_grad[axis, :, chunk] = total
+    return points_grad, planes_grad
+
+
+@_blend_backward.register_fake
+def _(_grad, points, planes, _rows, _matrix):
+    dense = torch.contiguous_format
+    return torch.empty_like(points, memory_format=dense), torch.empty_like(planes, memory_format=dense)
+
+
+def _save(ctx, inputs, output) -> None:  # noqa: ARG001 - PyTorch names its arguments
+    points, planes, ctx.rows, matrix = inputs
+    ctx.save_for_backward(points, planes, *matrix)
+
+
+def _backward(ctx, grad):
+    points, planes, *matrix = ctx.saved_tensors
+    gradients = torch.ops.soma_core.blend_backward(grad, points, planes, ctx.rows, matrix)
+    return *gradients, None, [None] * len(matrix)
+
+
+_blend.register_autograd(_backward, setup_context=_save)
 
 
 class Skinning(torch.nn.Module):
@@ -134,7 +155,7 @@ class Skinning(torch.nn.Module):
             transforms: (B, J, 3, 4) from :func:`skinning_transforms`.
         """
         planes = transforms.permute(2, 3, 1, 0)
-        return _Blend.apply(points, planes, rows, *self.weights.csr, *self.weights.transpose)
+        return _blend(points, planes, rows, [*self.weights.csr, *self.weights.transpose])
 
     def into(self, out: Tensor, points: Tensor, transforms: Tensor) -> None:
         """Write skinned vertices into `out`, contiguous (B, v, 3); no derivative."""
@@ -155,5 +176,6 @@ class Skinning(torch.nn.Module):
         parts = []
         for chunk in _chunks(len(transforms)):
             part = gather_rows(dense[..., chunk].flatten(1), pattern, transpose)
-            parts.append(part.view(len(vertices), 3, -1).permute(2, 0, 1))
+            width = part.shape[1] // 3
+            parts.append(part.view(len(vertices), 3, width).permute(2, 0, 1))
         return parts[0].contiguous() if len(parts) == 1 else torch.cat(parts)
