@@ -191,3 +191,16 @@ def test_transforms_take_the_bind_pose_to_the_posed_one():
     torch.testing.assert_close(found, (posed @ torch.linalg.inv(bind))[..., :3, :])
     one = skinning_transforms(posed[..., :3, :3], posed[..., :3, 3], bind[:1])
     torch.testing.assert_close(one[1], (posed[1] @ torch.linalg.inv(bind[0]))[..., :3, :])
+
+
+@pytest.mark.parametrize("rows", [True, False])
+@pytest.mark.parametrize("shared", [True, False])
+def test_operator_is_registered_soundly(rows, shared):
+    """Schema, shapes without data, autograd and tracing, by torch's own checker."""
+    weights = build().weights
+    rest, transforms = case(3, torch.float64, shared=shared)
+    leaves = (
+        part.detach().requires_grad_() for part in (rest.permute(2, 1, 0), transforms.permute(2, 3, 1, 0))
+    )
+    args = (*leaves, rows, [*weights.csr, *weights.transpose])
+    torch.library.opcheck(torch.ops.soma_core.blend.default, args)
