@@ -17,6 +17,8 @@ Csr = tuple[Tensor, Tensor, Tensor]
 def sparse_product(matrix: Csr, dense: Tensor) -> Tensor:
     """Product of a sparse (m, n) matrix in CSR form and a contiguous dense (n, f) one; no derivative."""
     crow, col, val = matrix
+    if dense.shape[1] == 0:  # an empty batch, which embedding_bag refuses
+        return dense.new_empty(crow.shape[0] - 1, 0)
     return embedding_bag(col, dense, crow, mode="sum", per_sample_weights=val, include_last_offset=True)
 
 

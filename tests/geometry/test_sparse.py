@@ -29,7 +29,7 @@ def matrix(rows=30, columns=20, density=0.2, seed=0):
 
 
 @pytest.mark.parametrize("dtype", DTYPES)
-@pytest.mark.parametrize("width", [1, 3, 96])
+@pytest.mark.parametrize("width", [0, 1, 3, 96])
 def test_equals_the_dense_product(width, dtype):
     sparse, dense = matrix()
     operator = SparseRows(sparse, dtype=dtype, device=CPU)
