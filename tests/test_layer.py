@@ -240,13 +240,11 @@ def test_from_newborn_to_old_age():
 def test_composed_equals_exact(backend):
     """Real backends, float64: the composed operator is the exact path to a hundredth of a millimetre."""
     if backend == "anny":
-        count, given = 6, {"age": torch.linspace(-0.3, 1, 6).double(), "gender": torch.rand(6).double()}
-        given["weight"], given["height"] = (
-            torch.rand(6, generator=g).double() for g in (GENERATOR, GENERATOR)
-        )
-        given["gender"] = torch.rand(6, generator=GENERATOR).double()
+        random = torch.rand(4, 6, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+        given = dict(zip(("gender", "weight", "height", "muscle"), random, strict=True))
+        given["age"] = torch.linspace(-0.3, 1, 6, dtype=torch.float64)
     else:
-        count, given = 6, {"shape": 2 * randn(6, 20)}
+        given = {"shape": 2 * randn(6, 20)}
     composed, exact = (real(backend, torch.float64, exact=choice).identity(given) for choice in (False, True))
     assert composed.batch_size == 6
     for name in ("fitted_rest", "rest"):
