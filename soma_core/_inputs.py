@@ -8,13 +8,14 @@ from torch import Tensor
 from soma_core.errors import InputError
 from soma_core.geometry.rotations import axis_angle_to_matrix, orthonormality_error
 
-__all__ = ["check_rotations", "check_translation"]
+__all__ = ["check_kind", "check_rotations", "check_translation"]
 
 _ROTATION_TOLERANCE = 1e-2
 """Largest accepted entry of |R^T R - I|: above it a matrix is a mistake, not rounding."""
 
 
-def _check_kind(name: str, value: object, dtype: torch.dtype, device: torch.device) -> None:
+def check_kind(name: str, value: object, dtype: torch.dtype, device: torch.device) -> None:
+    """Refuse what is no tensor, or a tensor of another dtype or device."""
     if not isinstance(value, Tensor):
         raise InputError(
             name,
@@ -57,7 +58,7 @@ def check_rotations(
     rotations: Tensor, joint_count: int, dtype: torch.dtype, device: torch.device, *, validate: bool
 ) -> Tensor:
     """Matrices (batch, joints, 3, 3) from axis-angle or matrices, or a clear refusal."""
-    _check_kind("rotations", rotations, dtype, device)
+    check_kind("rotations", rotations, dtype, device)
     shape = tuple(rotations.shape)
     axis_angle = rotations.ndim == 3 and shape[1:] == (joint_count, 3)
     if not axis_angle and not (rotations.ndim == 4 and shape[1:] == (joint_count, 3, 3)):
@@ -84,6 +85,8 @@ def _shape_hint(shape: tuple[int, ...], joint_count: int) -> str:
 
 
 def _check_orthonormal(rotations: Tensor) -> None:
+    if not rotations.numel():
+        return
     error = orthonormality_error(rotations)
     worst = int(error.argmax())
     if float(error.flatten()[worst]) > _ROTATION_TOLERANCE:
@@ -97,12 +100,12 @@ def _check_orthonormal(rotations: Tensor) -> None:
 
 
 def check_translation(
-    translation: Tensor | None, batch: int, dtype: torch.dtype, device: torch.device, *, validate: bool
+    translation: Tensor | None, batch: int, dtype: torch.dtype, device: torch.device
 ) -> Tensor:
     """Hips positions (batch, 3) [m]; zeros when None."""
     if translation is None:
         return torch.zeros(batch, 3, dtype=dtype, device=device)
-    _check_kind("translation", translation, dtype, device)
+    check_kind("translation", translation, dtype, device)
     if tuple(translation.shape) not in ((3,), (1, 3), (batch, 3)):
         raise InputError(
             "translation",
@@ -110,6 +113,5 @@ def check_translation(
             expected=f"({batch}, 3), (1, 3) or (3,)",
             fix="Give one Hips position [m] a pose.",
         )
-    if validate:
-        _check_finite("translation", translation)
+    _check_finite("translation", translation)
     return translation.expand(batch, 3)

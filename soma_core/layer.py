@@ -8,7 +8,7 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
-from soma_core._inputs import check_rotations, check_translation
+from soma_core._inputs import check_kind, check_rotations, check_translation
 from soma_core.animation.engine import Animation
 from soma_core.animation.posed import Posed
 from soma_core.backends.parameters import batch_parameters
@@ -153,10 +153,23 @@ class SomaLayer(torch.nn.Module):
         relative = check_rotations(
             rotations, len(self.joint_names), self.dtype, self.device, validate=self.validate
         )
+        self._check_identity(identity)
         batch = _common_batch(identity.batch_size, len(relative))
-        shift = check_translation(translation, batch, self.dtype, self.device, validate=self.validate)
+        shift = check_translation(translation, batch, self.dtype, self.device)
         relative = relative.expand(batch, *relative.shape[1:])
         return self.animation.pose(identity, relative, shift, absolute=absolute)
+
+    def _check_identity(self, identity: Identity) -> None:
+        """Refuse an identity that another kind of layer made: other rig, LOD, dtype or device."""
+        same_rig = not identity.rig_revision or identity.rig_revision == self.rig.revision
+        if not same_rig or identity.rest.shape[1] != self.mesh.vertex_count:
+            raise InputError(
+                "identity",
+                got=f"{identity.rest.shape[1]} vertices on rig {identity.rig_revision or 'unknown'}",
+                expected=f"{self.mesh.vertex_count} vertices on rig {self.rig.revision}",
+                fix="Make it with this layer's identity().",
+            )
+        check_kind("identity", identity.rest, self.dtype, self.device)
 
     def forward(
         self,
@@ -176,7 +189,7 @@ class SomaLayer(torch.nn.Module):
         )
         identities = len(next(iter(batch.values()), relative))
         size = _common_batch(identities, len(relative))
-        shift = check_translation(translation, size, self.dtype, self.device, validate=self.validate)
+        shift = check_translation(translation, size, self.dtype, self.device)
         relative = relative.expand(size, *relative.shape[1:])
         tracked = torch.is_grad_enabled() and any(
             tensor.requires_grad for tensor in (*batch.values(), relative, shift)

@@ -70,12 +70,13 @@ class ComposedRestShape(torch.nn.Module):
         if len(rows) == 1:  # MKL multiplies by two columns three times faster than by one
             rows = torch.cat((rows, rows))
         stacked = torch.addmm(self.template, self.basis, rows.T)[:, : len(coefficients)]
-        batch, size = len(coefficients), 3 * self.vertex_count
-        points, moments = stacked[:size].unflatten(0, (3, -1)), stacked[size:].unflatten(0, (-1, 3))
+        size = 3 * self.vertex_count
+        points = stacked[:size].unflatten(0, (3, self.vertex_count))
+        moments = stacked[size:].unflatten(0, (4 * self.fit.joint_count, 3))
         if self.exact is not None:
             offsets = self.exact.evaluate(coefficients)
             points = points.index_add(1, self.exact.rows, offsets.transpose(0, 1))
-            moments = moments + (self.offset_moments @ offsets.flatten(1)).view(-1, 3, batch)
+            moments = moments + (self.offset_moments @ offsets.flatten(1)).view(*moments.shape)
         moments = moments.unflatten(0, (self.fit.joint_count, 4)).permute(3, 0, 1, 2)
         return points, self.fit.from_moments(moments)
 

@@ -38,7 +38,7 @@ def start() -> None:
 
 @contextlib.contextmanager
 def _native_stderr_closed() -> Iterator[None]:
-    """Drop what native code writes to stderr: Warp 1.19 warns of a missing GPU there, past its own log level."""
+    """Drop what native code writes to stderr: Warp 1.19 warns of a missing GPU there."""
     sys.stderr.flush()
     saved, sink = os.dup(2), os.open(os.devnull, os.O_WRONLY)
     try:

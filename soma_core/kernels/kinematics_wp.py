@@ -42,6 +42,8 @@ def _walk(relative: Tensor, offsets: Tensor, order: Tensor, parents: Tensor) -> 
     kernels = _kernels(scalar_name(relative.dtype))
     turns = torch.empty_like(relative, memory_format=torch.contiguous_format)
     positions = torch.empty_like(offsets, memory_format=torch.contiguous_format)
+    if not turns.numel():  # Warp takes no view of an empty tensor
+        return turns, positions
     with launching(relative) as device:
         wp.launch(
             kernels.walk,
@@ -69,6 +71,8 @@ def _walk_backward(
 ) -> tuple[Tensor, Tensor]:  # fmt: skip
     kernels = _kernels(scalar_name(relative.dtype))
     relative_grad, offsets_grad = torch.zeros_like(relative), torch.zeros_like(offsets)
+    if not relative.numel():
+        return relative_grad, offsets_grad
     matrices, vectors = kernels.mat33, kernels.vec3
     # The walk writes its outputs again and accumulates into their gradients, so it gets copies.
     turns, positions = turns.clone(), positions.clone()

@@ -7,110 +7,19 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from soma_core.geometry.kabsch import PRIOR_STRENGTH
 from soma_core.kernels._runtime import as_warp, launching, scalar_name
+from soma_core.kernels.rotation_functions_wp import bone_functions, kabsch_function
 
 __all__ = ["fit_displacements"]
-
-_NEWTON_STEPS = 9
-
-
-def _rotation_functions(scalar: str, module: wp.Module) -> SimpleNamespace:
-    real = getattr(wp, scalar)
-    vec3, mat33 = wp.types.vector(3, real), wp.types.matrix((3, 3), real)
-    prior = wp.constant(real(PRIOR_STRENGTH))
-    floor = wp.constant(real(1e-24 if scalar == "float32" else 1e-162))
-    tiny = wp.constant(real(1e-30 if scalar == "float32" else 1e-100))
-    newton_steps = wp.constant(_NEWTON_STEPS)
-    converged = wp.constant(real(1e-9 if scalar == "float32" else 1e-20))
-    opposite = wp.constant(real(1e-7 if scalar == "float32" else 1e-12))
-
-    @wp.func(module=module)
-    def cofactor(m: mat33):
-        a, b, c = (
-            vec3(m[0, 0], m[0, 1], m[0, 2]),
-            vec3(m[1, 0], m[1, 1], m[1, 2]),
-            vec3(m[2, 0], m[2, 1], m[2, 2]),
-        )
-        return wp.matrix_from_rows(wp.cross(b, c), wp.cross(c, a), wp.cross(a, b))
-
-    @wp.func(module=module)
-    def nearest(covariance: mat33):
-        gram = wp.transpose(covariance) * covariance
-        mean = wp.trace(gram) / real(3.0)
-        centred = gram - mean * wp.identity(n=3, dtype=real)
-        spread = wp.sqrt(wp.ddot(centred, centred) / real(6.0))
-        half = real(0.5) * wp.determinant(centred / wp.max(spread, tiny))
-        angle = wp.acos(wp.clamp(half, real(-1.0), real(1.0))) / real(3.0)
-        scale = wp.sqrt(wp.max(mean + real(2.0) * spread * wp.cos(angle), real(0.0)))
-        unit = covariance / wp.max(scale, tiny)
-        x = unit + cofactor(unit)
-        step = int(0)  # noqa: UP018, RUF046 - a dynamic variable to Warp, so that the loop can end early
-        while step < newton_steps:
-            step += 1
-            adjugate = cofactor(x)
-            det = x[0, 0] * adjugate[0, 0] + x[0, 1] * adjugate[0, 1] + x[0, 2] * adjugate[0, 2]
-            if wp.abs(det) < real(1e-30):
-                det = real(1e-30)
-            stretch = wp.sqrt(wp.sqrt(wp.ddot(adjugate, adjugate) / wp.ddot(x, x)) / wp.abs(det))
-            following = real(0.5) * (stretch * x + adjugate / (stretch * det))
-            change = following - x
-            x = following
-            if wp.ddot(change, change) < converged:
-                break
-        return x
-
-    @wp.func_grad(nearest)
-    def adj_nearest(covariance: mat33, adj_ret: mat33):
-        rotation = nearest(covariance)
-        stretch = wp.transpose(rotation) * covariance
-        stretch = real(0.5) * (stretch + wp.transpose(stretch))
-        system = wp.trace(stretch) * wp.identity(n=3, dtype=real) - stretch
-        local = wp.transpose(rotation) * adj_ret
-        torque = vec3(local[2, 1] - local[1, 2], local[0, 2] - local[2, 0], local[1, 0] - local[0, 1])
-        det = wp.determinant(system)
-        if wp.abs(det) < tiny:
-            det = tiny
-        u = (cofactor(system) * torque) / det
-        wp.adjoint[covariance] += rotation * wp.skew(u)
-
-    @wp.func(module=module)
-    def from_covariance(covariance: mat33):
-        pull = prior * wp.sqrt(wp.ddot(covariance, covariance) + floor)
-        return nearest(covariance + pull * wp.identity(n=3, dtype=real))
-
-    @wp.func(module=module)
-    def arc(source: vec3, target: vec3):
-        a, b = wp.normalize(source), wp.normalize(target)
-        total = a + b
-        if wp.dot(total, total) < opposite:
-            axis = vec3(real(0.0), real(0.0), real(1.0))
-            if wp.abs(a[0]) <= wp.abs(a[1]) and wp.abs(a[0]) <= wp.abs(a[2]):
-                axis = vec3(real(1.0), real(0.0), real(0.0))
-            elif wp.abs(a[1]) <= wp.abs(a[2]):
-                axis = vec3(real(0.0), real(1.0), real(0.0))
-            total = wp.cross(a, axis)
-        middle = wp.normalize(total)
-        eye = wp.identity(n=3, dtype=real)
-        return (real(2.0) * wp.outer(middle, middle) - eye) * (real(2.0) * wp.outer(a, a) - eye)
-
-    @wp.func(module=module)
-    def pair_normal(first: vec3, second: vec3, first_goal: vec3, second_goal: vec3):
-        source, goal = wp.cross(first, second), wp.cross(first_goal, second_goal)
-        area = wp.sqrt(wp.sqrt((wp.dot(source, source) + tiny) * (wp.dot(goal, goal) + tiny)))
-        return wp.outer(goal, source) / area
-
-    return SimpleNamespace(
-        vec3=vec3, mat33=mat33, from_covariance=from_covariance, arc=arc, pair_normal=pair_normal
-    )
 
 
 @functools.cache
 def _kernels(scalar: str, width: int) -> SimpleNamespace:
     module = wp.get_module(f"soma_skeleton_fit_{scalar}_{width}")
-    functions = _rotation_functions(scalar, module)
-    vec3, mat33 = functions.vec3, functions.mat33
-    from_covariance, arc, pair_normal = functions.from_covariance, functions.arc, functions.pair_normal
+    real = getattr(wp, scalar)
+    vec3, mat33 = wp.types.vector(3, real), wp.types.matrix((3, 3), real)
+    from_covariance = kabsch_function(scalar, module)
+    arc, pair_normal = bone_functions(scalar, module)
 
     @wp.kernel(module=module)
     def displace(
@@ -120,21 +29,19 @@ def _kernels(scalar: str, width: int) -> SimpleNamespace:
         b, p = wp.tid()
         k = wp.int32(pivots[p])
         first = from_covariance(covariances[b, k])
-        if children[p, 1] < wp.int64(0):
-            c = wp.int32(children[p, 0])
+        c = wp.int32(children[p, 0])
+        if children[p, 1] == pivots[p]:
             out[b, p] = arc(first * (bind[c] - bind[k]), joints[b, c] - joints[b, k]) * first
         else:
             total = mat33()
             for e in range(width):  # unrolled: Warp differentiates a dynamic loop over sums wrongly
-                c0 = wp.int32(children[p, e])
-                if c0 >= 0:
-                    bone, reach = first * (bind[c0] - bind[k]), joints[b, c0] - joints[b, k]
-                    total += wp.outer(reach, bone)
-                    for f in range(width):
-                        c1 = wp.int32(children[p, f])
-                        if f > e and c1 >= 0:
-                            other, far = first * (bind[c1] - bind[k]), joints[b, c1] - joints[b, k]
-                            total += pair_normal(bone, other, reach, far)
+                c = wp.int32(children[p, e])
+                bone, reach = first * (bind[c] - bind[k]), joints[b, c] - joints[b, k]
+                total += wp.outer(reach, bone)
+                for f in range(width):  # every pair comes twice; equal ones and the padding add zero
+                    d = wp.int32(children[p, f])
+                    other, far = first * (bind[d] - bind[k]), joints[b, d] - joints[b, k]
+                    total += real(0.5) * pair_normal(bone, other, reach, far)
             out[b, p] = from_covariance(total) * first
 
     return SimpleNamespace(vec3=vec3, mat33=mat33, displace=displace)
@@ -146,6 +53,8 @@ def _fit(
 ) -> Tensor:  # fmt: skip
     kernels = _kernels(scalar_name(joints.dtype), children.shape[1])
     out = joints.new_empty(len(joints), len(pivots), 3, 3)
+    if not out.numel():  # Warp takes no view of an empty tensor
+        return out
     with launching(joints) as device:
         wp.launch(
             kernels.displace,
@@ -173,6 +82,8 @@ def _fit_backward(
     covariances_grad = torch.zeros_like(covariances, memory_format=contiguous)
     grad = grad.clone(memory_format=contiguous)
     scratch = torch.empty_like(grad)
+    if not grad.numel():
+        return joints_grad, covariances_grad
     with launching(joints) as device:
         wp.launch(
             kernels.displace,
@@ -219,6 +130,6 @@ def fit_displacements(
         covariances: (B, J, 3, 3).
         bind: (J, 3) bind positions [m].
         pivots: (p,) int64 joint ids.
-        children: (p, width) int64 child ids of each pivot, at least two columns, padded with -1.
+        children: (p, width) int64 child ids of each pivot, at least two columns, padded with the pivot.
     """
     return _fit(joints.contiguous(), covariances.contiguous(), bind, pivots, children)

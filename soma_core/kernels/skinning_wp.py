@@ -83,6 +83,8 @@ def _skin(
         _kernels(scalar_name(points.dtype)),
         torch.empty_like(points, memory_format=torch.contiguous_format),
     )
+    if not out.numel():  # Warp takes no view of an empty tensor
+        return out
     with launching(points) as device:
         wp.launch(
             kernels.forward,
@@ -107,6 +109,8 @@ def _skin_backward(
     kernels = _kernels(scalar_name(points.dtype))
     points_grad = torch.empty_like(points, memory_format=torch.contiguous_format)
     transforms_grad = torch.empty_like(transforms, memory_format=torch.contiguous_format)
+    if not points.numel():
+        return points_grad, transforms_grad.zero_()
     grad = grad.contiguous()
     warp_grad = as_warp(grad, kernels.vec3)
     with launching(points) as device:

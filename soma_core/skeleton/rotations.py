@@ -80,7 +80,7 @@ class RotationFit(torch.nn.Module):
             )
 
         keep("pivots", plan.pivots)
-        keep("child_table", table)
+        keep("child_table", np.where(table < 0, plan.pivots[:, None], table))  # padded with itself
         keep("single", single)
         keep("single_child", table[single, 0])
         keep("several", several)

@@ -1,1 +1,3 @@
-"""TBD."""
+"""What backend authors import in their tests."""
+
+__all__: list[str] = []
