@@ -1,6 +1,5 @@
 """SomaLayer: batches, purity, gradients, compilation, dtypes and every refusal."""
 
-import copy
 import dataclasses
 import functools
 import threading
@@ -515,7 +514,7 @@ def test_shared_identity_collects_the_gradients_of_all_poses(tiny):
 def test_torch_and_warp_agree(tiny, batch, dtype, twin, device):
     results = []
     for kernels in ("torch", twin):
-        layer = tiny(dtype, kernels) if device == "cpu" else copy.copy(tiny(dtype, kernels)).to(device)
+        layer = tiny(dtype, kernels, device=device)
         given = {name: value.to(device).requires_grad_() for name, value in params(batch, dtype).items()}
         turns, place = (part.to(device).requires_grad_() for part in poses(batch, dtype))
         posed = layer(given, turns, place)
@@ -592,6 +591,19 @@ def test_compiled_gradients(tiny, fresh_compiler, kernels):
     expected, found = (torch.autograd.grad(function(*leaves), leaves) for function in (loss, compiled))
     for one, other in zip(expected, found, strict=True):
         torch.testing.assert_close(other, one, atol=1e-8, rtol=1e-8)
+
+
+@pytest.mark.filterwarnings("ignore::DeprecationWarning:torch")
+@pytest.mark.parametrize("kernels", ["torch", "auto"])
+def test_compiles_for_batches_that_eager_cuts_into_parts(tiny, fresh_compiler, kernels):
+    layer, given, (turns, place) = (
+        tiny(torch.float32, kernels),
+        params(70, torch.float32),
+        poses(70, torch.float32),
+    )
+    compiled = torch.compile(lambda r: layer(given, r, place).vertices, fullgraph=True, backend="aot_eager")
+    with torch.no_grad():
+        torch.testing.assert_close(compiled(turns), layer(given, turns, place).vertices, atol=1e-5, rtol=0)
 
 
 # --- dtypes and devices ---------------------------------------------------------------------------------
