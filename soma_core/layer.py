@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Mapping
 from typing import Any, Literal
 
@@ -69,6 +70,11 @@ class SomaLayer(torch.nn.Module):
         registry: Registry | None = None,
     ) -> None:
         super().__init__()
+        self._given = {
+            "backend": backend, "options": dict(options or {}), "lod": lod, "kernels": kernels,
+            "exact": exact, "repose": repose, "validate": validate, "canonical": canonical,
+            "registry": registry,
+        }  # fmt: skip
         _check_choice("lod", lod, ("mid", "low"))
         _check_choice("kernels", kernels, ("auto", "torch", "warp"))
         _check_choice("dtype", dtype, (torch.float32, torch.float64))
@@ -98,6 +104,10 @@ class SomaLayer(torch.nn.Module):
             _check_choice("dtype", probe.dtype, (torch.float32, torch.float64))
             self._build(probe.device, probe.dtype)
         return self
+
+    def __reduce__(self):
+        """Copy and pickle by building again: a layer is what it was built from."""
+        return functools.partial(SomaLayer, **self._given, device=self.device, dtype=self.dtype), ()
 
     @property
     def joint_names(self) -> tuple[str, ...]:
@@ -194,6 +204,7 @@ class SomaLayer(torch.nn.Module):
         tracked = torch.is_grad_enabled() and any(
             tensor.requires_grad for tensor in (*batch.values(), relative, shift)
         )
+        tracked = tracked or torch.compiler.is_compiling()  # a compiler plans its own memory
         whole = tracked or identities < size or size <= _CHUNK or self.animation.warp_skinning
         if whole:
             identity = self._identity(batch, *self.rest_shape(batch))

@@ -1,7 +1,9 @@
 """SomaLayer: batches, purity, gradients, compilation, dtypes and every refusal."""
 
+import copy
 import dataclasses
 import functools
+import pickle
 import threading
 
 import numpy as np
@@ -863,3 +865,12 @@ def test_identities_of_another_layer_are_refused(tiny):
         tiny(torch.float64).pose(tiny(torch.float32).identity({}), rotations_of(1, JOINTS, 3))
     with pytest.raises(InputError, match="identity: got"):
         real("soma", lod="mid").pose(real("soma").identity({}), turns)
+
+
+@pytest.mark.parametrize("through", [copy.deepcopy, lambda layer: pickle.loads(pickle.dumps(layer))])
+def test_copies_and_pickles_by_building_again(through):
+    """A worker process or an averaged model gets the same bodies."""
+    layer = real("soma")
+    other = through(layer)
+    given, turns = {"shape": torch.ones(1, 4)}, 0.1 * torch.ones(1, 77, 3)
+    torch.testing.assert_close(other(given, turns).vertices, layer(given, turns).vertices, atol=0, rtol=0)

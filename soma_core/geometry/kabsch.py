@@ -9,8 +9,10 @@ from torch import Tensor
 
 __all__ = ["PRIOR_STRENGTH", "cofactor", "rotation_from_covariance"]
 
-PRIOR_STRENGTH = 1e-4
-"""Weight of the reference rotation, relative to the covariance: decides only degenerate clouds."""
+PRIOR_STRENGTH = 1e-5
+"""Weight of the reference rotation, relative to the covariance: decides only degenerate clouds.
+
+Far above float32 rounding and far below any limb: 1e-4 would turn slender limbs by up to 5e-3 rad."""
 
 _NEWTON_STEPS = 9
 """Scaled Newton steps; eight suffice for condition 1e16 (Higham 2008, section 8.6), one is spare."""

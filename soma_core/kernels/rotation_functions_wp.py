@@ -42,7 +42,7 @@ def _nearest_function(scalar: str, module: wp.Module, cofactor: wp.Function) -> 
             if wp.ddot(change, change) < converged:
                 break
         change = x - cofactor(x)  # zero for a rotation; not a number where reflections tie exactly
-        if not wp.ddot(change, change) < real(1e-6):
+        if not (wp.ddot(change, change) < real(1e-6) and wp.determinant(x) > real(0.5)):
             x = wp.identity(n=3, dtype=real)
         return x
 

@@ -111,7 +111,8 @@ def test_rank_one_maps_the_direction_and_follows_the_reference_about_it(dtype):
     found = rotation_from_covariance(given).double()
     assert orthonormality_error(found).max() < 10 * ORTHONORMAL[dtype]
     turned = (found @ direction[..., None]).squeeze(-1)
-    torch.testing.assert_close(turned, target, atol=3 * PRIOR_STRENGTH, rtol=0)
+    rounding = 1e-8 / PRIOR_STRENGTH if dtype == torch.float32 else 0  # of H, against the pull that decides
+    torch.testing.assert_close(turned, target, atol=3 * PRIOR_STRENGTH + rounding, rtol=0)
     if dtype == torch.float64:
         torch.testing.assert_close(found, kabsch(with_prior(given)), atol=1e-9, rtol=0)
 
