@@ -82,6 +82,9 @@ def _time_batch(config: DictConfig, layer: SomaLayer, batch: int) -> list[dict[s
     params, poses = _inputs(config, layer, batch)
     with torch.no_grad():
         shared = layer.identity({name: value[:1] for name, value in params.items()})
+        identities = layer.identity(params)
+        given = identities.params
+        points, fitted = layer.rest_shape(given)
     tracked = {name: value.clone().requires_grad_() for name, value in params.items()}
     turned = poses.clone().requires_grad_()
 
@@ -90,8 +93,10 @@ def _time_batch(config: DictConfig, layer: SomaLayer, batch: int) -> list[dict[s
 
     cases: dict[str, Callable[[], object]] = {
         "forward": torch.no_grad()(lambda: layer(params, poses)),
-        "identity": torch.no_grad()(lambda: layer.identity(params)),
-        "pose": torch.no_grad()(lambda: layer.pose(shared, poses)),
+        "  rest shape and skeleton fit": torch.no_grad()(lambda: layer.rest_shape(given)),
+        "  repose to bind": torch.no_grad()(lambda: layer.animation.repose(points, fitted)),
+        "  pose, an identity each": torch.no_grad()(lambda: layer.pose(identities, poses)),
+        "pose, one identity": torch.no_grad()(lambda: layer.pose(shared, poses)),
         "forward + backward": both,
     }
     rows = []
