@@ -7,8 +7,9 @@ from __future__ import annotations
 
 import zipfile
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -21,7 +22,7 @@ if TYPE_CHECKING:
     import torch
     from torch import Tensor
 
-__all__ = ["NativeGenerator", "component_count", "soma_backend", "soma_generator"]
+__all__ = ["NativeGenerator", "NativeOptions", "component_count", "soma_backend", "soma_generator"]
 
 _FILE = "SOMA_neutral.npz"
 
@@ -47,6 +48,18 @@ def component_count(path: Path) -> int:
     return int(count)
 
 
+@dataclass(frozen=True, kw_only=True)
+class NativeOptions:
+    """Options of the native backend.
+
+    Attributes:
+        shape_space: another file in the layout of ``SOMA_neutral.npz``; None is the shipped one. Its
+            leading components are used; missing ones leave the body unchanged.
+    """
+
+    shape_space: str | None = None
+
+
 @hookimpl
 def soma_backend() -> BackendSpec:
     """Declare the native shape space: centimetres, +Y up, +Z forward, already on the canonical mesh."""
@@ -64,19 +77,28 @@ def soma_backend() -> BackendSpec:
                 description="coefficients in standard deviations; a shorter list is padded with zeros",
             ),
         ),
+        options=NativeOptions,
         licence="Apache-2.0",
         description=f"the native shape space, {count} components",
     )
 
 
 @hookimpl
-def soma_generator(device: torch.device, dtype: torch.dtype) -> Generator:
-    """Build the generator from the shipped shape space; it has no options and needs no declaration."""
+def soma_generator(
+    spec: BackendSpec, device: torch.device, dtype: torch.dtype, options: Mapping[str, Any]
+) -> Generator:
+    """Build the generator from the shipped shape space, or from the one that the options name."""
     from soma_core.rig.neutral import load_shape_space
 
-    space = load_shape_space()
+    path = options.get("shape_space")
+    space = load_shape_space(Path(path).expanduser() if path else None)
     scaled = np.sqrt(space.eigenvalues.astype(np.float64))[:, None] * space.shapedirs
-    return NativeGenerator(space.mean, scaled.reshape(-1, *space.mean.shape), device=device, dtype=dtype)
+    (count,) = spec.params[0].shape
+    directions = scaled[:count].reshape(-1, *space.mean.shape)
+    if len(directions) < count:
+        missing = np.zeros((count - len(directions), *space.mean.shape))
+        directions = np.concatenate((directions, missing))
+    return NativeGenerator(space.mean, directions, device=device, dtype=dtype)
 
 
 class NativeGenerator:

@@ -9,6 +9,7 @@ import torch
 
 from soma_core.backends.native import NativeGenerator, component_count, soma_backend
 from soma_core.errors import AssetError
+from soma_core.paths import assets_dir
 from soma_core.plugin.registry import default_registry
 from soma_core.plugin.spec import HasLinearBasis
 from soma_core.rig.neutral import load_shape_space
@@ -83,3 +84,21 @@ def test_unreadable_shape_space_is_named(tmp_path):
     np.savez(path, eigenvalues=np.zeros((2, 2)))
     with pytest.raises(AssetError, match="too many values"):
         component_count(path)
+
+
+@pytest.mark.parametrize("count", [3, 130])
+def test_a_shape_space_from_elsewhere(tmp_path, count):
+    """Fewer components are padded, more are cut to the declared ones."""
+    shipped = load_shape_space()
+    random = np.random.default_rng(4)
+    path = tmp_path / "elsewhere.npz"
+    directions = random.normal(size=(count, shipped.mean.size)).astype(np.float32)
+    eigenvalues = np.full(count, 4.0, np.float32)
+    np.savez(path, mean=shipped.mean + 1, shapedirs=directions, eigenvalues=eigenvalues, metadata="{}")
+    generator = default_registry().generator(
+        "soma", device=CPU, dtype=torch.float64, options={"shape_space": str(path)}
+    )
+    shape = torch.zeros(1, component_count(assets_dir() / "SOMA_neutral.npz"), dtype=torch.float64)
+    shape[0, 2] = 0.5
+    expected = (shipped.mean + 1).astype(np.float64) + directions[2].reshape(-1, 3)
+    np.testing.assert_allclose(generator.rest({"shape": shape})[0].numpy(), expected, atol=1e-5)

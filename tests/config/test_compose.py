@@ -62,7 +62,7 @@ def test_a_run_says_what_it_takes_to_run_it_again(run: Run) -> None:
     assert isinstance(folder, Path)
     config = yaml.safe_load((folder / "config.yaml").read_text())
     assert config["lod"] == "low"
-    assert config["backend"] == {"name": "soma", "params": {"shape": None}, "options": {}}
+    assert config["backend"] == {"name": "soma", "params": {"shape": None}, "options": {"shape_space": None}}
     environment = json.loads((folder / "environment.json").read_text())
     assert environment["command"] == ["soma", "animate", "lod=low", "seed=3"]
     assert environment["seed"] == 3
