@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import sys
+import time
 from collections.abc import Iterable, Iterator
 from typing import TypeVar
 
@@ -14,7 +15,7 @@ _Step = TypeVar("_Step")
 
 
 def progress(
-    steps: Iterable[_Step], *, label: str, total: int, done: int = 0, lines: int = 20
+    steps: Iterable[_Step], *, label: str, total: int, done: int = 0, lines: int = 20, after: float = 0.0
 ) -> Iterator[_Step]:
     """Pass `steps` on and show how far they are.
 
@@ -24,14 +25,15 @@ def progress(
         total: number of steps, those done before included.
         done: number of steps done before.
         lines: how many lines at most where there is no terminal.
+        after: seconds before the first of them: short work needs none.
     """
     if sys.stderr.isatty():
         from tqdm import tqdm
 
         yield from tqdm(steps, desc=label, total=total, initial=done, file=sys.stderr)
         return
-    every = max(1, total // lines)
+    every, begin = max(1, total // lines), time.monotonic()
     for number, step in enumerate(steps, start=done + 1):
         yield step
-        if number % every == 0 or number == total:
+        if (number % every == 0 or number == total) and time.monotonic() - begin >= after:
             _log.info("%s: %d of %d", label, number, total)

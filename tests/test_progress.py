@@ -30,3 +30,10 @@ def test_a_terminal_gets_a_bar(caplog, monkeypatch):
         assert list(progress("abc", label="work", total=3)) == ["a", "b", "c"]
     assert "work: 100%" in terminal.getvalue()
     assert not caplog.records
+
+
+def test_short_work_says_nothing(caplog, monkeypatch):
+    monkeypatch.setattr("sys.stderr", io.StringIO())
+    with caplog.at_level(logging.INFO):
+        assert list(progress(range(3), label="work", total=3, after=60.0)) == [0, 1, 2]
+    assert not caplog.records

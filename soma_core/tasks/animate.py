@@ -168,7 +168,9 @@ def _posed_chunks(
     """First frame and posed body of each chunk."""
     absolute = motion.convention == "absolute_local"
     starts = range(0, motion.frame_count, _CHUNK)
-    shown = progress(starts, label="posing", total=len(starts), lines=4) if len(starts) > 1 else starts
+    shown = (
+        progress(starts, label="posing", total=len(starts), lines=4, after=5.0) if len(starts) > 1 else starts
+    )
     for start in shown:
         part = slice(start, start + _CHUNK)
         rotations = torch.as_tensor(motion.rotations[part], dtype=layer.dtype, device=layer.device)

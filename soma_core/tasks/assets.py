@@ -31,8 +31,14 @@ def build_assets(output: Path, shape_space: Path | None = None) -> None:
         AssetError: the pinned source is not installed, or the shape space is of another rig.
     """
     from soma_core.rig.build import build_assets as build
+    from soma_core.rig.neutral import load_shape_space
 
     manifest = build(Path(output), None if shape_space is None else Path(shape_space))
+    if not load_shape_space(Path(output) / NEUTRAL_NAME).eigenvalues.size:
+        _log.warning(
+            "%s holds no shape components: run soma train-shape, then soma assets build --shape-space FILE",
+            Path(output) / NEUTRAL_NAME,
+        )
     _log.info("assets of rig %s are in %s", manifest.rig_revision, output)
 
 

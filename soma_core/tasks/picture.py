@@ -110,8 +110,9 @@ def gallery(path: Path, bodies: Sequence[Body], *, width: int = 1600, columns: i
     Raises:
         SomaError: pyvista is not installed.
     """
-    rows = [_line(bodies[start : start + columns]) for start in range(0, len(bodies), columns)]
     top = max(float(body.vertices[:, 1].max()) for body in bodies) * 1.14
+    distance = top / 2 / np.tan(np.radians(_VIEW_ANGLE / 2))
+    rows = [_line(bodies[start : start + columns], distance) for start in range(0, len(bodies), columns)]
     span = max(*(width for _, _, width in rows), 1.5 * top)
     pictures = []
     with _stage((width, int(width * top / span))) as stage:
@@ -121,17 +122,28 @@ def gallery(path: Path, bodies: Sequence[Body], *, width: int = 1600, columns: i
     atomic_write(path, lambda target: _stacked(pictures).save(target, "PNG"))
 
 
-def _line(bodies: Sequence[Body], *, gap: float = 0.16) -> tuple[list[Body], np.ndarray, float]:
+def _spin(degrees: float) -> np.ndarray:
+    """Rotation about +Y, (3, 3)."""
+    turn = np.radians(degrees)
+    return np.array([[np.cos(turn), 0, np.sin(turn)], [0, 1, 0], [-np.sin(turn), 0, np.cos(turn)]])
+
+
+def _line(
+    bodies: Sequence[Body], distance: float, *, gap: float = 0.16
+) -> tuple[list[Body], np.ndarray, float]:
     """Turn bodies a little and line them up along x.
+
+    Each is turned by its bearing as well, so that a camera at `distance` [m] sees all from one side.
 
     Returns:
         The bodies, the x under which each carries most of its mass, and the width of the line [m].
     """
-    turn = np.radians(-_AZIMUTH)
-    spin = np.array([[np.cos(turn), 0, np.sin(turn)], [0, 1, 0], [-np.sin(turn), 0, np.cos(turn)]])
-    turned = [body.vertices @ spin.T for body in bodies]
-    widths = np.array([np.ptp(vertices[:, 0]) + gap for vertices in turned])
+    widths = np.array([np.ptp((body.vertices @ _spin(-_AZIMUTH).T)[:, 0]) + gap for body in bodies])
     places = np.cumsum(widths) - widths / 2 - widths.sum() / 2
+    bearings = np.degrees(np.arctan2(places, distance))
+    turned = [
+        body.vertices @ _spin(-_AZIMUTH - bearing).T for body, bearing in zip(bodies, bearings, strict=True)
+    ]
     moved = []
     for body, vertices, place in zip(bodies, turned, places, strict=True):
         middle = (vertices.min(axis=0) + vertices.max(axis=0)) / 2
