@@ -13,6 +13,7 @@ import numpy as np
 import torch
 from omegaconf import DictConfig
 
+from soma_core.backends.rest_shape import ComposedRestShape
 from soma_core.cache import atomic_write
 from soma_core.errors import SomaError
 from soma_core.evaluation.random_poses import random_axis_angles
@@ -99,6 +100,11 @@ def _time_batch(config: DictConfig, layer: SomaLayer, batch: int) -> list[dict[s
         "pose, one identity": torch.no_grad()(lambda: layer.pose(shared, poses)),
         "forward + backward": both,
     }
+    if isinstance(layer.rest_shape, ComposedRestShape):
+        rest_shape, columns = layer.rest_shape, layer.rest_shape.coefficients(given).T
+        cases["    product with the basis"] = torch.no_grad()(
+            lambda: torch.addmm(rest_shape.template, rest_shape.basis, columns)
+        )
     rows = []
     for case, call in cases.items():
         median = _median_ms(call, config.repeats, layer.device)
