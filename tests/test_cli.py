@@ -30,6 +30,13 @@ def test_help_lists_every_task(capsys) -> None:
     assert all(name in text for name in TASKS)
 
 
+@pytest.mark.parametrize("task", TASKS)
+def test_help_of_a_task_starts_with_its_verb(task: str, capsys) -> None:
+    with pytest.raises(SystemExit, match="^0$"):  # hydra ends the process once it has printed its help
+        main([task, "--help"])
+    assert capsys.readouterr().out.startswith(f"usage: soma {task} [key=value ...]\n")
+
+
 def test_nothing_asked_for_is_a_usage_error(capsys) -> None:
     assert main([]) == EXIT_USAGE
     assert "usage: soma" in capsys.readouterr().out
