@@ -61,11 +61,17 @@ def plot_errors(rows: Sequence[ErrorRow], path: Path) -> bool:
     if importlib.util.find_spec("matplotlib") is None:
         return False
     from matplotlib.figure import Figure
+    from matplotlib.ticker import FixedLocator, LogLocator, NullFormatter
 
     figure = Figure(figsize=(6, 4), layout="constrained")
     axes = figure.add_subplot()
     for key, label in (("mean_mm", "mean"), ("p95_mm", "95th percentile"), ("max_mm", "largest")):
         axes.loglog([row["components"] for row in rows], [row[key] for row in rows], marker="o", label=label)
+    axes.xaxis.set_major_locator(FixedLocator([row["components"] for row in rows]))
+    axes.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+    for axis in (axes.xaxis, axes.yaxis):
+        axis.set_major_formatter("{x:g}")  # 0.5, not 5 x 10^-1
+        axis.set_minor_formatter(NullFormatter())
     axes.set_xlabel("components")
     axes.set_ylabel("vertex error on held-out bodies [mm]")
     axes.grid(visible=True, which="both", alpha=0.3)
