@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from omegaconf import DictConfig
 
     from soma_core.io.motion import Motion
+    from soma_core.plugin.spec import BackendSpec
 
 __all__ = ["draw_gallery"]
 
@@ -29,6 +30,13 @@ _log = logging.getLogger(__name__)
 
 _IDENTITIES = 3
 """Bodies a backend: its default and two random ones."""
+
+_DEVIATION = 1 / 3
+"""Of half the range of a coefficient: one standard deviation where the range is three of them."""
+
+_FIRST, _LATER = 0.7, 1.2
+"""Most that a coefficient departs from zero, in standard deviations. The first is size, and bodies of one and
+a half are giants that no model has seen."""
 
 _POSE_SECOND = 10.75
 """Second of the shipped clip that shows a pose with depth: a lifted knee, the arms swinging."""
@@ -62,12 +70,24 @@ def _one_frame(motion: Motion, frame: int) -> Motion:
     return replace(motion, rotations=motion.rotations[part], translation=motion.translation[part])
 
 
+def _random_parameters(spec: BackendSpec, count: int, random: np.random.Generator) -> dict[str, np.ndarray]:
+    """Draw `count` identities that differ visibly in build and stay believable."""
+    groups = {parameter.group for parameter in spec.params} - {""}  # hundreds of details: left alone
+    drawn = sample_parameters(spec, count, random, spread=_DEVIATION, skip_groups=groups)
+    for parameter in spec.params:
+        if parameter.name in drawn and parameter.shape and parameter.default == 0:
+            low, high = parameter.range
+            limits = np.full(parameter.shape, _LATER * _DEVIATION * (high - low) / 2)
+            limits.flat[:1] *= _FIRST / _LATER
+            drawn[parameter.name] = np.clip(drawn[parameter.name], -limits, limits)
+    return drawn
+
+
 def _bodies(name: str, config: DictConfig, pose: Motion) -> list[Body]:
     """The default identity of a backend, then random ones, posed and standing on the floor."""
     layer = SomaLayer(name, lod=str(config.lod), device=config.device, kernels=str(config.kernels))
     generator = np.random.default_rng(config.seed)
-    groups = {parameter.group for parameter in layer.spec.params} - {""}  # hundreds of details: left alone
-    random = sample_parameters(layer.spec, _IDENTITIES - 1, generator, skip_groups=groups)
+    random = _random_parameters(layer.spec, _IDENTITIES - 1, generator)
     choices = [{}, *({key: rows[i] for key, rows in random.items()} for i in range(_IDENTITIES - 1))]
     found = []
     for params in choices:

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from soma_core.errors import SomaError
+from soma_core.tasks import picture
 from soma_core.tasks.picture import Body, backend_colour, contact_sheet, gallery
 
 PIL = pytest.importorskip("PIL.Image", reason="pictures need pyvista and Pillow")
@@ -78,3 +79,16 @@ def test_colours_are_steady_and_distinct():
     assert backend_colour("mybody") == backend_colour("mybody")
     names = ("soma", "anny", "mhr", "mybody", "other")
     assert len({backend_colour(name) for name in names}) == len(names)
+
+
+def test_gallery_turns_every_body_alike_towards_the_camera():
+    distance, bodies = 5.0, [box(1.0, 1.7, (1, 0, 0))] * 5
+    moved, _, _ = picture._line(bodies, distance)
+    seen = []
+    for body in moved:
+        front = body.vertices[4] - body.vertices[0]  # the edge that pointed along +x
+        towards = (
+            np.array([0, distance]) - (body.vertices[:, [0, 2]].min(0) + body.vertices[:, [0, 2]].max(0)) / 2
+        )
+        seen.append(np.arctan2(front[2], front[0]) - np.arctan2(towards[1], towards[0]))
+    np.testing.assert_allclose(seen, seen[0], atol=1e-9)
