@@ -42,6 +42,8 @@ _VIEW_ANGLE = 18.0
 _AZIMUTH, _ELEVATION = 24.0, 7.0
 _GALLERY_AZIMUTH = 8.0
 """Less than in a contact sheet: there the pose that identities share hides one leg behind the other."""
+_MARGIN, _SIDE = 1.13, 1.17
+"""Height and width of a view in units of the body in it: more than what fades at the edges of a cell."""
 _SKIN = {"ambient": 0.24, "diffuse": 0.86, "specular": 0.16, "specular_power": 14}
 _SUN = np.array([0.05, -0.15])
 """Horizontal shift of a shadow for each metre above the floor (x, z)."""
@@ -87,17 +89,44 @@ def contact_sheet(path: Path, bodies: Sequence[Body], *, width: int = 1600, colu
     columns = min(columns, len(bodies))
     boxes = np.array([[body.vertices.min(axis=0), body.vertices.max(axis=0)] for body in bodies])
     floor = boxes[:, 0, 1].min()
-    height = (boxes[:, 1, 1].max() - floor) * 1.12
-    middle = boxes.mean(axis=1)
+    feet = boxes.mean(axis=1)
+    feet[:, 1] = floor
     reach = max(float((boxes[:, 1, axis] - boxes[:, 0, axis]).max()) for axis in (0, 2)) * 1.1
-    cell = (width // columns, int(width / columns * max(height / reach, 0.9)))
+    tall = (boxes[:, 1, 1].max() - floor) * 1.12
+    cell = (width // columns, int(width / columns * max(tall / reach, 0.9)))
+    rise, height = _framing(bodies, feet, cell[0] / cell[1])
     cells = []
     with _stage(cell) as stage:
-        for body, centre in zip(bodies, middle, strict=True):
-            focus = (centre[0], floor + height * 0.45, centre[2])
-            shot = stage.shot([body], focus=focus, height=max(height, reach * cell[1] / cell[0]))
-            cells.append(_faded(shot))
+        for body, place in zip(bodies, feet + np.array([0, rise, 0]), strict=True):
+            cells.append(_faded(stage.shot([body], focus=place, height=height)))
     atomic_write(path, lambda target: _grid(cells, bodies, columns).save(target, "PNG"))
+
+
+def _framing(bodies: Sequence[Body], feet: np.ndarray, aspect: float) -> tuple[float, float]:
+    """Aim the camera so that it sees every body whole, with a margin in which shadows may fade.
+
+    A hand near the camera is seen lower than where it is, so the sides of the bodies do not tell.
+
+    Args:
+        bodies: one a frame.
+        feet: (frames, 3) [m], the point of the floor below each.
+        aspect: width of a cell by its height.
+
+    Returns:
+        Height of the focus above the floor and height of the view there, both in metres.
+    """
+    side, up, towards = _camera_axes(_AZIMUTH)
+    points = [body.vertices - place for body, place in zip(bodies, feet, strict=True)]
+    across, above, near = (np.concatenate([part @ axis for part in points]) for axis in (side, up, towards))
+    rise, height = 0.0, 2 * float(np.ptp(above))
+    for _ in range(8):  # the nearer the camera, the wider the body: settles within a millimetre
+        distance = height / 2 / np.tan(np.radians(_VIEW_ANGLE / 2))
+        scale = distance / (distance - near + rise * towards[1])
+        shown = (above - rise * up[1]) * scale
+        low, high = shown.min(), shown.max()
+        rise += float(low + high) / 2
+        height = max(float(high - low) * _MARGIN, 2 * float(np.abs(across * scale).max()) * _SIDE / aspect)
+    return rise, height
 
 
 def gallery(path: Path, bodies: Sequence[Body], *, width: int = 1600, columns: int = 8) -> None:
@@ -249,12 +278,23 @@ class _Stage:
 
     def _aim(self, focus: np.ndarray, height: float, *, azimuth: float) -> None:
         distance = height / 2 / np.tan(np.radians(_VIEW_ANGLE / 2))
-        side, up = np.radians(azimuth), np.radians(_ELEVATION)
-        direction = np.array([np.sin(side) * np.cos(up), np.sin(up), np.cos(side) * np.cos(up)])
+        direction = _camera_axes(azimuth)[2]
         camera = self._plotter.camera
         camera.view_angle = _VIEW_ANGLE
         camera.focal_point, camera.position, camera.up = focus, focus + distance * direction, (0, 1, 0)
         self._plotter.renderer.ResetCameraClippingRange()
+
+
+def _camera_axes(azimuth: float) -> np.ndarray:
+    """Rows: what the camera sees as rightwards and as upwards, and the direction towards it."""
+    side, up = np.radians(azimuth), np.radians(_ELEVATION)
+    return np.array(
+        [
+            [np.cos(side), 0, -np.sin(side)],
+            [-np.sin(side) * np.sin(up), np.cos(up), -np.cos(side) * np.sin(up)],
+            [np.sin(side) * np.cos(up), np.sin(up), np.cos(side) * np.cos(up)],
+        ]
+    )
 
 
 def _shadow(bodies: Sequence[Body], pixel: float = 0.01) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:

@@ -1,6 +1,7 @@
 """Pictures show what they were given: every cell its own body, nobody cut off."""
 
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -46,6 +47,19 @@ def test_contact_sheet_draws_each_frame_anew(pyvista, tmp_path):
     assert heights[0] > 1.5 * heights[1] > 2 * heights[2] > 0
     assert not mask[[0, -1]].any()
     assert not mask[:, [0, 99, 100, 199, 200, 299]].any()
+
+
+def test_nothing_near_the_camera_fades_at_the_edge_of_its_cell(pyvista, tmp_path):
+    red = (0.9, 0.2, 0.2)
+    low = box(0.5, 0.3, red)
+    bodies = [box(0.4, 1.7, red), replace(low, vertices=low.vertices * [1, 1, 6])]
+    contact_sheet(tmp_path / "sheet.png", bodies, width=400, columns=2)
+    mask = painted(tmp_path / "sheet.png", red)
+    tall = len(mask) - picture._caption_sizes(200)[1]
+    assert np.flatnonzero(mask.any(axis=1)).max() < (1 - 0.035) * tall
+    columns = np.flatnonzero(mask[:, 200:].any(axis=0))
+    assert columns.min() > 0.06 * 200
+    assert columns.max() < 0.94 * 200
 
 
 def test_contact_sheet_wraps_into_rows(pyvista, tmp_path):
