@@ -99,12 +99,15 @@ class IdentityStream:
             stream: `TRAINING` or `HELD_OUT`.
             batch: number of the batch in its stream.
             count: identities; each comes from one backend, chosen by the shares.
+
+        Raises:
+            InputError: a parameter is drawn that the options of its backend leave out.
         """
         random = np.random.default_rng([self._seed, stream, batch])
         counts = random.multinomial(count, self._shares)
         parts = [
-            self._one_backend(layer, number, random)
-            for layer, number in zip(self._layers.values(), counts, strict=True)
+            self._one_backend(name, number, random)
+            for name, number in zip(self._layers, counts, strict=True)
             if number
         ]
         shapes = np.concatenate(parts)
@@ -112,13 +115,26 @@ class IdentityStream:
         shapes[..., 1] -= shapes[..., 1].min(axis=1, keepdims=True)
         return shapes
 
-    def _one_backend(self, layer: IdentityLayer, count: int, random: np.random.Generator) -> np.ndarray:
+    def _one_backend(self, name: str, count: int, random: np.random.Generator) -> np.ndarray:
+        layer = self._layers[name]
         params = sample_parameters(
             layer.spec, count, random, spread=self._spread, skip_groups=self._skip_groups
         )
         parts = []
         for start in range(0, count, _CHUNK):
-            chunk = {name: value[start : start + _CHUNK] for name, value in params.items()}
-            rest = layer.identity(chunk).rest.detach().cpu().numpy()
+            chunk = {key: value[start : start + _CHUNK] for key, value in params.items()}
+            try:
+                rest = layer.identity(chunk).rest.detach().cpu().numpy()
+            except InputError as error:
+                raise _refused(error, name, layer.spec) from error
             parts.append(_CM_PER_M * rest.astype(np.float64))
         return np.concatenate(parts)
+
+
+def _refused(error: InputError, backend: str, spec: BackendSpec) -> InputError:
+    """Say how to mend a parameter that was drawn but that the backend's options leave out."""
+    group = next((item.group for item in spec.params if error.argument == f"params[{item.name!r}]"), "")
+    fix = f"Enable it in options.{backend}"
+    if group:
+        fix += f", or leave its group at the defaults with 'skip_groups=[{group}]'"
+    return InputError(error.argument, got=error.got, expected=error.expected, fix=f"{fix}.")

@@ -89,3 +89,20 @@ def test_unusable_mixture_is_named(mix):
 def test_layers_must_match_the_mixture():
     with pytest.raises(InputError, match=r"layers: got \['x'\], expected \['y'\]"):
         IdentityStream({"x": Layer()}, {"y": 1.0}, seed=0)
+
+
+@pytest.mark.parametrize(
+    ("parameter", "fix"),
+    [
+        ("nose", r"Enable it in options\.x, or leave its group.*'skip_groups=\[local\]'\.$"),
+        ("age", r"Enable it in options\.x\.$"),
+    ],
+)
+def test_a_parameter_that_the_options_leave_out_is_named_with_what_to_change(parameter, fix):
+    class Refusing(Layer):
+        def identity(self, params=None):
+            raise InputError(f"params[{parameter!r}]", got="it", expected="less", fix="Add backend.options.y")
+
+    stream = IdentityStream({"x": Refusing()}, {"x": 1.0}, seed=0)
+    with pytest.raises(InputError, match=rf"params\['{parameter}'\]: got it, expected less\. {fix}"):
+        stream.shapes(TRAINING, 0, 2)
