@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-__all__ = ["KNOWN_BACKENDS", "install_line"]
+__all__ = ["KNOWN_BACKENDS", "install_line", "publication"]
 
 KNOWN_BACKENDS = {
     "anny": "soma-backend-anny",
@@ -12,10 +12,20 @@ KNOWN_BACKENDS = {
     "smplh": "soma-backend-smpl",
     "smplx": "soma-backend-smpl",
 }
-"""Backend name -> the distribution that provides it."""
+"""Backend name -> the distribution that provides it, or will: none is published on an index yet."""
+
+_IN_CHECKOUT = {"anny": "./plugins/anny"}
+"""Backend name -> its folder in this repository."""
 
 
 def install_line(name: str) -> str | None:
     """Return the pip line that installs backend `name`, or None for a name nobody has told us of."""
     distribution = KNOWN_BACKENDS.get(name)
     return f"pip install {distribution}" if distribution else None
+
+
+def publication(name: str) -> str:
+    """Return what to know before the pip line of a known backend is run: where the package is today."""
+    folder = _IN_CHECKOUT.get(name)
+    where = f"; from a checkout: pip install {folder}" if folder else ""
+    return f"{KNOWN_BACKENDS[name]} is not published yet{where}"

@@ -26,7 +26,7 @@ from soma_core.plugin.errors import (
     Stage,
     UnknownBackendError,
 )
-from soma_core.plugin.known import KNOWN_BACKENDS, install_line
+from soma_core.plugin.known import KNOWN_BACKENDS, install_line, publication
 from soma_core.plugin.spec import API_VERSION, BackendSpec, Generator
 
 if TYPE_CHECKING:
@@ -196,18 +196,13 @@ class Registry:
     def _record(self, name: str) -> _Record:
         if name in self._records:
             return self._records[name]
-        installed = ", ".join(self._records) or "none"
+        cause = f"no installed distribution offers it; installed are: {', '.join(self._records) or 'none'}"
         line = install_line(name)
         if line is None:
             fix = did_you_mean(name, [*self._records, *KNOWN_BACKENDS]) or "See: soma backends list"
         else:
-            fix = f"Run: {line}"
-        raise UnknownBackendError(
-            who=f'backend "{name}"',
-            stage="lookup",
-            cause=f"no installed distribution offers it; installed are: {installed}",
-            fix=fix,
-        )
+            cause, fix = f"{cause} ({publication(name)})", f"Run: {line}"
+        raise UnknownBackendError(who=f'backend "{name}"', stage="lookup", cause=cause, fix=fix)
 
     def _declare(self, record: _Record) -> None:
         """Import the plugin, register its hooks with a manager of its own, and check its declaration."""

@@ -190,6 +190,13 @@ def test_unknown_but_known_of_names_the_distribution(name: str, line: str) -> No
         Registry([good()]).spec(name)
 
 
+def test_a_package_that_is_not_published_is_not_promised() -> None:
+    with pytest.raises(UnknownBackendError, match=r"soma-backend-smpl is not published yet\)\. Run"):
+        Registry([good()]).spec("smplx")
+    with pytest.raises(UnknownBackendError, match=r"from a checkout: pip install \./plugins/anny\)\. Run"):
+        Registry([good()]).spec("anny")
+
+
 def test_unknown_and_nothing_close_points_to_the_list() -> None:
     with pytest.raises(UnknownBackendError, match='"zzz".*installed are: none. See: soma backends list'):
         Registry([]).spec("zzz")
