@@ -38,7 +38,8 @@ RANKS = [
 RANK = {name: rank for rank, names in enumerate(RANKS) for name in names}
 
 # Packages that stand alone: nothing else of the core, whatever its rank.
-ALONE = {"geometry": {"errors"}, "plugin": {"errors", "paths", "cache"}}
+# The contract names the type of a check that a plugin may give; it is imported for typing only.
+ALONE = {"geometry": {"errors"}, "plugin": {"errors", "paths", "cache", "testing"}}
 
 TOP_LEVEL = {"soma_core", "plugins", "assets", "configs", "tests", "benchmarks", "docs", ".ci"}
 VAGUE_NAMES = {"utils", "util", "common", "helpers", "misc"}
@@ -66,6 +67,7 @@ PUBLIC_NAMES = [
 ]
 HOOKS = {
     "soma_backend": [],
+    "soma_checks": [],
     "soma_generator": ["spec", "device", "dtype", "options"],
 }
 

@@ -11,7 +11,7 @@ from typing import Any, get_args
 from soma_core.errors import InputError
 from soma_core.plugin.spec import Axis, BackendSpec, FileNeeded, Parameter, Unit, WrapPair
 
-__all__ = ["checked_options", "did_you_mean", "spec_problem"]
+__all__ = ["checked_options", "checks_problem", "did_you_mean", "spec_problem"]
 
 _NAME = re.compile(r"[A-Za-z_][A-Za-z0-9_-]*")
 
@@ -74,6 +74,14 @@ def spec_problem(spec: object, name: str) -> str | None:
         or _params_problem(spec.params)
         or _parts_problem(spec)
     )
+
+
+def checks_problem(checks: Iterable[object]) -> str | None:
+    """Say which of the checks that a plugin gives is none, or return None."""
+    for check in checks:
+        if not (isinstance(getattr(check, "id", None), str) and callable(getattr(check, "run", None))):
+            return f"soma_checks gave {check!r:.80}, expected a soma_core.testing.Check"
+    return None
 
 
 def checked_options(spec: BackendSpec, options: Mapping[str, Any]) -> dict[str, Any]:

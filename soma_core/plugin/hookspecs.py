@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import pluggy
@@ -12,7 +12,17 @@ from soma_core.plugin.spec import BackendSpec, Generator
 if TYPE_CHECKING:
     import torch
 
-__all__ = ["ENTRY_POINT_GROUP", "PROJECT", "hookimpl", "hookspec", "soma_backend", "soma_generator"]
+    from soma_core.testing import Check
+
+__all__ = [
+    "ENTRY_POINT_GROUP",
+    "PROJECT",
+    "hookimpl",
+    "hookspec",
+    "soma_backend",
+    "soma_checks",
+    "soma_generator",
+]
 
 PROJECT = "soma"
 ENTRY_POINT_GROUP = "soma_core.backends"
@@ -31,3 +41,8 @@ def soma_generator(  # type: ignore[empty-body]
     spec: BackendSpec, device: torch.device, dtype: torch.dtype, options: Mapping[str, Any]
 ) -> Generator:
     """Build the native generator on `device` with floating type `dtype`."""
+
+
+@hookspec
+def soma_checks() -> Sequence[Check]:  # type: ignore[empty-body]
+    """Give further conformance checks of this backend, besides those of the core. Optional."""

@@ -15,7 +15,7 @@ import pluggy
 
 from soma_core.errors import InputError
 from soma_core.plugin import hookspecs
-from soma_core.plugin.declaration import checked_options, did_you_mean, spec_problem
+from soma_core.plugin.declaration import checked_options, checks_problem, did_you_mean, spec_problem
 from soma_core.plugin.discovery import CORE_PACKAGE, EntryPointLike, Offer, config_folder, find_offers
 from soma_core.plugin.errors import (
     BackendConflictError,
@@ -31,6 +31,8 @@ from soma_core.plugin.spec import API_VERSION, BackendSpec, Generator
 
 if TYPE_CHECKING:
     import torch
+
+    from soma_core.testing import Check
 
 __all__ = ["OLDEST_API_VERSION", "Entry", "Registry", "State", "default_registry"]
 
@@ -114,6 +116,14 @@ class Registry:
             for offer in record.offers
         )
 
+    def offers(self, name: str) -> tuple[Offer, ...]:
+        """Return who offers backend `name`, without importing a plugin; several where they conflict.
+
+        Raises:
+            UnknownBackendError: nobody offers it.
+        """
+        return self._record(name).offers
+
     def spec(self, name: str) -> BackendSpec:
         """Return the declaration of backend `name`, importing its plugin on first use.
 
@@ -161,6 +171,22 @@ class Registry:
                 )
         record.state, record.error = "built", None
         return generator
+
+    def checks(self, name: str) -> tuple[Check, ...]:
+        """Return the further conformance checks that the plugin of backend `name` gives; often none.
+
+        Raises:
+            BackendError: the backend is not usable, or what it gives are no checks.
+        """
+        self.spec(name)
+        record = self._records[name]
+        assert record.manager is not None
+        with _isolated(record, "hooks"):
+            found = tuple(check for given in record.manager.hook.soma_checks() for check in given)
+            problem = checks_problem(found)
+            if problem is not None:
+                raise _broken(record, "hooks", problem)
+        return found
 
     def config_dirs(self) -> tuple[tuple[str, Path], ...]:
         """Return (distribution, folder) of each plugin that ships hydra configs, importing none of them."""

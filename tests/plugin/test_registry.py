@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Callable
 from dataclasses import dataclass
+from types import SimpleNamespace
 
 import pytest
 
@@ -164,6 +166,33 @@ def test_a_generator_needs_a_rest_method() -> None:
     plugin = hooks(soma_backend=lambda: SOUND, soma_generator=lambda: "mesh")
     with pytest.raises(BrokenBackendError, match="soma_generator returned str without a rest method"):
         Registry([FakeEntryPoint("good", plugin)]).generator("good", **BUILD)
+
+
+def test_checks_of_a_plugin_are_optional_and_isolated() -> None:
+    check = SimpleNamespace(id="acme.watertight", run=lambda context: None)
+
+    def registry(**more: Callable[..., object]) -> Registry:
+        plugin = hooks(soma_backend=lambda: SOUND, soma_generator=lambda: FakeGenerator(), **more)
+        return Registry([FakeEntryPoint("good", plugin)])
+
+    assert registry().checks("good") == ()
+    assert registry(soma_checks=lambda: [check]).checks("good") == (check,)
+    with pytest.raises(BrokenBackendError, match="hooks: soma_checks gave 'watertight', expected a"):
+        registry(soma_checks=lambda: ["watertight"]).checks("good")
+    with pytest.raises(BrokenBackendError, match="hooks: SystemExit: 4"):
+        registry(soma_checks=_exit).checks("good")
+
+
+def test_offers_say_who_without_importing_anything() -> None:
+    points = [FakeEntryPoint("good", distribution="acme"), FakeEntryPoint("good", distribution="bodies")]
+    registry = Registry(points)
+    assert [(offer.distribution, offer.version, offer.package) for offer in registry.offers("good")] == [
+        ("acme", "1.0", "soma_backend_good"),
+        ("bodies", "1.0", "soma_backend_good"),
+    ]
+    assert [point.loads for point in points] == [0, 0]
+    with pytest.raises(UnknownBackendError, match='"other"'):
+        registry.offers("other")
 
 
 def test_unknown_name_suggests_the_closest() -> None:
