@@ -1,0 +1,5 @@
+"""Pose inversion: posed vertices of any backend to the rig's rotations (paper, section 3.6)."""
+
+from soma_core.inversion.result import InversionResult
+
+__all__ = ["InversionResult"]

@@ -1,0 +1,36 @@
+"""The result of pose inversion: the rig's rotations that reproduce posed vertices."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from torch import Tensor
+
+__all__ = ["InversionResult"]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class InversionResult:
+    """Pose of every frame, and how well it explains the target; paper, section 3.6.
+
+    ``layer.pose(identity, result.rotations, result.translation)`` is the reconstruction.
+
+    Attributes:
+        rotations: T-pose-relative rotations, (frames, J - 1, 3, 3).
+        translation: world position of the Hips [m], (frames, 3).
+        vertex_error: distance of each canonical vertex of the reconstruction to its target [m], (frames, v);
+            NaN where the target has no value for that vertex or the frame is not valid.
+        valid: (frames,) bool; False where a frame could not be used (NaN, collapsed, mirrored, out of scale).
+            Its rotations are identity, and no other frame is affected.
+        converged: (frames,) bool; the last accepted step no longer lowered the energy noticeably.
+        iterations: (frames,) int, accepted steps.
+        residual: root mean square of the weighted vertex error [m], (frames,).
+    """
+
+    rotations: Tensor
+    translation: Tensor
+    vertex_error: Tensor
+    valid: Tensor
+    converged: Tensor
+    iterations: Tensor
+    residual: Tensor
