@@ -11,7 +11,7 @@ import numpy as np
 
 from soma_core.errors import AssetError, InputError
 
-__all__ = ["NpzFields", "check_rotations", "open_npz"]
+__all__ = ["NpzFields", "check_rotations", "open_npz", "refuse_missing"]
 
 ORTHONORMAL_TOLERANCE = 1e-3
 """Largest entry of |RᵀR - I| accepted; half-precision files reach 5e-4, a scaled matrix does not pass."""
@@ -111,8 +111,8 @@ class NpzFields:
         return values[0]
 
 
-def _refuse_unreadable(path: Path) -> None:
-    """Raise for a file that is missing, a git-LFS pointer or no ZIP archive."""
+def refuse_missing(path: Path) -> bytes:
+    """Raise for a file that is missing or a git-LFS pointer; return its first bytes."""
     if not path.is_file():
         raise AssetError(path, cause="no such file", fix="Check the path.")
     with open(path, "rb") as stream:
@@ -123,6 +123,12 @@ def _refuse_unreadable(path: Path) -> None:
             cause="this is a git-LFS pointer, not the file itself",
             fix="Run `git lfs install && git lfs pull` in the repository it came from.",
         )
+    return head
+
+
+def _refuse_unreadable(path: Path) -> None:
+    """Raise for a file that is missing, a git-LFS pointer or no ZIP archive."""
+    head = refuse_missing(path)
     if not zipfile.is_zipfile(path):
         raise AssetError(
             path, cause=f"not an NPZ file (it starts with {head[:8]!r})", fix="Give a complete .npz file."

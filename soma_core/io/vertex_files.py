@@ -1,0 +1,75 @@
+"""Open vertices over time, whatever file they are in; the suffix tells the format."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Literal
+
+from soma_core.errors import InputError
+from soma_core.io.npz_fields import refuse_missing
+from soma_core.io.vertex_arrays import open_npy, open_npz_vertices
+from soma_core.io.vertex_folder import FolderSequence
+from soma_core.io.vertex_glb import GlbSequence
+from soma_core.io.vertex_sequence import UpAxis, VertexSequence
+from soma_core.io.vertex_usd import UsdSequence
+from soma_core.topology.frames import METRES
+
+__all__ = ["open_vertex_sequence"]
+
+_READERS = {
+    ".npz": open_npz_vertices, ".npy": open_npy, ".glb": GlbSequence,
+    ".usd": UsdSequence, ".usda": UsdSequence, ".usdc": UsdSequence, ".usdz": UsdSequence,
+}  # fmt: skip
+
+
+def open_vertex_sequence(
+    path: str | Path,
+    *,
+    fps: float | None = None,
+    unit: Literal["m", "cm", "mm"] | None = None,
+    up: UpAxis | None = None,
+) -> VertexSequence:
+    """Open the vertices of a mesh over time; frames are read when they are asked for.
+
+    Args:
+        path: an ``.npz`` or ``.npy`` array (frames, n, 3), a folder of OBJ or PLY meshes, a ``.usd`` or
+            ``.glb`` with one animated mesh. Nothing in a file is executed.
+        fps: frame rate; overrides the file's own.
+        unit: length unit; overrides the file's own.
+        up: upward axis; overrides the file's own.
+
+    Raises:
+        AssetError: the file is missing, damaged or a git-LFS pointer.
+        InputError: a format or a layout that is not read, or a frame rate that is not positive.
+    """
+    path = Path(path).expanduser()
+    sequence = _open(path)
+    if fps is not None:
+        sequence.fps = float(fps)
+    if sequence.fps is not None and not (math.isfinite(sequence.fps) and sequence.fps > 0):
+        rate = sequence.fps
+        sequence.close()
+        raise InputError(
+            "fps", got=f"{rate:g}", expected="a positive number", fix="Give the frames per second."
+        )
+    if unit is not None:
+        sequence.metres = METRES[unit]
+    if up is not None:
+        sequence.up = up
+    return sequence
+
+
+def _open(path: Path) -> VertexSequence:
+    if path.is_dir():
+        return FolderSequence(path)
+    refuse_missing(path)
+    reader = _READERS.get(path.suffix.lower())
+    if reader is None:
+        raise InputError(
+            str(path),
+            got=f"the suffix {path.suffix!r}",
+            expected=f"{', '.join(_READERS)} or a folder of .obj or .ply files",
+            fix="Export the vertices in one of these formats.",
+        )
+    return reader(path)

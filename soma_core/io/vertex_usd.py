@@ -1,0 +1,128 @@
+"""Vertices of an animated USD mesh: points stored at each time, or skinned by UsdSkel."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from soma_core.errors import AssetError, InputError
+from soma_core.io.vertex_sequence import VertexSequence, even_rate
+
+__all__ = ["UsdSequence"]
+
+
+class UsdSequence(VertexSequence):
+    """World positions of the one mesh that moves, frame by frame; USD reads values when asked for them.
+
+    Args:
+        path: ``.usd``, ``.usda``, ``.usdc`` or ``.usdz``.
+
+    Raises:
+        AssetError: not a USD file.
+        InputError: no mesh or several that move, blend shapes, or samples at uneven times.
+    """
+
+    def __init__(self, path: Path) -> None:
+        from pxr import UsdGeom
+
+        self._stage = _open_stage(path)
+        self._points, self._skin, times = _moving_mesh(path, self._stage)
+        self._times = times or [self._stage.GetStartTimeCode()]
+        rate = self._stage.GetTimeCodesPerSecond()
+        super().__init__(
+            path,
+            len(self._times),
+            len(self._points.GetPointsAttr().Get(self._times[0]) or ()),
+            fps=even_rate(path, np.array(self._times) / rate),
+            metres=UsdGeom.GetStageMetersPerUnit(self._stage),
+            up="+z" if UsdGeom.GetStageUpAxis(self._stage) == UsdGeom.Tokens.z else "+y",
+        )
+
+    def _read(self, start: int, stop: int) -> np.ndarray:
+        return np.stack([self._frame(time) for time in self._times[start:stop]])
+
+    def _frame(self, time: float) -> np.ndarray:
+        from pxr import UsdGeom
+
+        points = self._points.GetPointsAttr().Get(time)
+        if len(points) != self.vertex_count:
+            raise InputError(
+                f"{self.path}: points at time {time:g}",
+                got=f"{len(points)} vertices",
+                expected=f"{self.vertex_count}, as at first",
+                fix="Export a mesh whose vertices stay the same.",
+            )
+        prim = self._points.GetPrim()
+        if self._skin is not None:
+            query, skeleton = self._skin
+            query.ComputeSkinnedPoints(skeleton.ComputeSkinningTransforms(time), points, time)
+            prim = skeleton.GetPrim()  # skinned points are in the space of the skeleton
+        world = np.array(UsdGeom.XformCache(time).GetLocalToWorldTransform(prim))
+        # USD multiplies row vectors from the left.
+        return np.array(points, np.float64) @ world[:3, :3] + world[3, :3]
+
+    def close(self) -> None:
+        """Let go of the stage."""
+        self._skin = self._points = self._stage = None
+
+
+def _open_stage(path: Path) -> Any:
+    from pxr import Usd
+
+    try:
+        return Usd.Stage.Open(str(path))
+    except RuntimeError as error:  # pxr raises Tf.ErrorException, a RuntimeError with C++ source lines
+        raise AssetError(path, cause="not a readable USD file", fix="Export it again.") from error
+
+
+def _moving_mesh(path: Path, stage: Any) -> tuple[Any, Any, list[float]]:
+    """The mesh, its (skinning query, skeleton query) or None, and its sample times."""
+    from pxr import UsdGeom
+
+    skins = _skinned(stage)
+    meshes = [UsdGeom.Mesh(prim) for prim in stage.Traverse() if prim.IsA(UsdGeom.Mesh)]
+    found = []
+    for mesh in meshes:
+        skin = skins.get(str(mesh.GetPath()))
+        times = mesh.GetPointsAttr().GetTimeSamples()
+        if skin is not None:
+            animation = skin[1].GetAnimQuery()
+            times = animation.GetJointTransformTimeSamples() if animation else []
+        found.append((mesh, skin, list(times)))
+    moving = [row for row in found if row[2]] or found
+    if len(moving) != 1:
+        names = ", ".join(str(mesh.GetPath()) for mesh, _, _ in moving)
+        raise InputError(
+            str(path),
+            got=f"{len(moving)} meshes {names}".strip(),
+            expected="one",
+            fix="Export the body alone.",
+        )
+    mesh, skin, times = moving[0]
+    if skin is not None and skin[0].HasBlendShapes():
+        raise InputError(
+            f"{path}: {mesh.GetPath()}",
+            got="blend shapes",
+            expected="skinning or points at each time",
+            fix="Bake the deformation into points, one time sample a frame.",
+        )
+    return mesh, skin, times
+
+
+def _skinned(stage: Any) -> dict[str, tuple[Any, Any]]:
+    """Path of each skinned mesh -> its skinning query and the query of its skeleton."""
+    from pxr import Usd, UsdSkel
+
+    found = {}
+    for prim in stage.Traverse():
+        if not prim.IsA(UsdSkel.Root):
+            continue
+        cache = UsdSkel.Cache()
+        cache.Populate(UsdSkel.Root(prim), Usd.PrimDefaultPredicate)
+        for binding in cache.ComputeSkelBindings(UsdSkel.Root(prim), Usd.PrimDefaultPredicate):
+            skeleton = cache.GetSkelQuery(binding.GetSkeleton())
+            for query in binding.GetSkinningTargets():
+                found[str(query.GetPrim().GetPath())] = (query, skeleton)
+    return found
