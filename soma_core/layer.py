@@ -94,6 +94,7 @@ class SomaLayer(torch.nn.Module):
         self.rest_shape = make_rest_shape(
             self.spec, generator, self.mesh, self.rig, device=device, dtype=dtype, exact=self.exact,
             warp=self.kernels != "torch", wrap_mesh=wrap_mesh,
+            isolated=functools.partial(self._registry.isolated, self.backend),
         )  # fmt: skip
         self.animation = Animation(self.rig, device=device, dtype=dtype, kernels=self.kernels)
 

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from contextlib import AbstractContextManager
+from typing import TypeAlias
 
 import numpy as np
 import scipy.sparse
@@ -10,6 +12,7 @@ import torch
 from torch import Tensor
 
 from soma_core.backends.parameters import batch_parameters
+from soma_core.plugin.errors import Stage
 from soma_core.plugin.spec import BackendSpec, Generator, HasLinearBasis, LinearBasis
 from soma_core.rig.mesh import CanonicalMesh
 from soma_core.rig.skeleton import Rig
@@ -18,22 +21,38 @@ from soma_core.topology.compose import compose
 from soma_core.topology.correspondence import load_correspondence
 from soma_core.topology.transfer import CanonicalPassThrough, TopologyTransfer, make_transfer
 
-__all__ = ["ComposedRestShape", "ExactRestShape", "make_rest_shape"]
+__all__ = ["ComposedRestShape", "ExactRestShape", "Isolation", "make_rest_shape"]
+
+Isolation: TypeAlias = Callable[[Stage], AbstractContextManager[None]]
+"""Makes whatever goes wrong inside an error of the backend; see ``Registry.isolated``."""
 
 
 class ExactRestShape(torch.nn.Module):
     """Generator, transfer and skeleton fit one after the other, on every vertex."""
 
     def __init__(
-        self, generator: Generator, transfer: TopologyTransfer | CanonicalPassThrough, fit: SkeletonFit
+        self,
+        generator: Generator,
+        transfer: TopologyTransfer | CanonicalPassThrough,
+        fit: SkeletonFit,
+        isolated: Isolation,
     ) -> None:
         super().__init__()
-        self.generator, self.transfer, self.fit = generator, transfer, fit
+        self.generator, self.transfer, self.fit, self._isolated = generator, transfer, fit, isolated
 
     def forward(self, params: Mapping[str, Tensor]) -> tuple[Tensor, Tensor]:
         """Vertices as planes (3, v, B) [m] and fitted transforms (B, J, 4, 4) [m]."""
-        vertices = self.transfer(self.generator.rest(params))
+        vertices = self.transfer(self._native(params))
         return vertices.permute(2, 1, 0), self.fit(vertices)
+
+    def _native(self, params: Mapping[str, Tensor]) -> Tensor:
+        if torch.compiler.is_compiling():  # a context around the plugin would break the graph
+            return self.generator.rest(params)
+        with self._isolated("rest"):
+            native = self.generator.rest(params)
+        with self._isolated("wrap"):
+            self.transfer.check(tuple(native.shape))
+        return native
 
 
 class ComposedRestShape(torch.nn.Module):
@@ -49,9 +68,10 @@ class ComposedRestShape(torch.nn.Module):
         transfer: TopologyTransfer | CanonicalPassThrough,
         fit: SkeletonFit,
         at: Tensor,
+        isolated: Isolation,
     ) -> None:
         super().__init__()
-        self.coefficients, self.fit = linear.coefficients, fit
+        self._linear_coefficients, self.fit, self._isolated = linear.coefficients, fit, isolated
         composed = compose(linear, transfer, at)
         self.vertex_count = len(composed.template) // 3
         matrix = fit.matrix
@@ -79,6 +99,13 @@ class ComposedRestShape(torch.nn.Module):
             moments = moments + (self.offset_moments @ offsets.flatten(1)).view(*moments.shape)
         moments = moments.unflatten(0, (self.fit.joint_count, 4)).permute(3, 0, 1, 2)
         return points, self.fit.from_moments(moments)
+
+    def coefficients(self, params: Mapping[str, Tensor]) -> Tensor:
+        """What the plugin makes of the parameters, (B, k)."""
+        if torch.compiler.is_compiling():
+            return self._linear_coefficients(params)
+        with self._isolated("rest"):
+            return self._linear_coefficients(params)
 
 
 def _stack(matrix: scipy.sparse.csr_array, vertex_major: Tensor) -> Tensor:
@@ -110,18 +137,26 @@ def make_rest_shape(
     exact: bool,
     warp: bool,
     wrap_mesh: CanonicalMesh,
+    isolated: Isolation,
 ) -> ExactRestShape | ComposedRestShape:
     """The rest-shape module of a backend: composed when it is linear, unless `exact` asks otherwise.
 
     `warp` chooses the Warp twin for the skeleton's rotations. `wrap_mesh` is the mid LOD, which wrap
-    pairs are made for.
+    pairs are made for. What the wrap pair or the plugin's own code does wrong goes through `isolated`.
+
+    Raises:
+        BackendError: stage ``wrap``: the pair is unusable or is not the generator's mesh; stage ``build``:
+            the linear basis cannot be had.
     """
     fit = SkeletonFit(mesh, rig, dtype=dtype, device=device, warp=warp)
-    correspondence = None if spec.wrap is None else load_correspondence(spec.wrap, wrap_mesh)
-    transfer = make_transfer(spec, mesh, correspondence, dtype=dtype, device=device)
+    with isolated("wrap"):
+        correspondence = None if spec.wrap is None else load_correspondence(spec.wrap, wrap_mesh)
+        transfer = make_transfer(spec, mesh, correspondence, dtype=dtype, device=device)
     if exact or not isinstance(generator, HasLinearBasis):
-        return ExactRestShape(generator, transfer, fit)
-    linear = generator.linear_basis()
-    with torch.no_grad():
-        at = linear.coefficients(batch_parameters(spec, {}, device=device, dtype=dtype))[0]
-    return ComposedRestShape(linear, transfer, fit, at)
+        return ExactRestShape(generator, transfer, fit, isolated)
+    with isolated("build"):
+        linear = generator.linear_basis()
+        with torch.no_grad():
+            at = linear.coefficients(batch_parameters(spec, {}, device=device, dtype=dtype))[0]
+    with isolated("wrap"):
+        return ComposedRestShape(linear, transfer, fit, at, isolated)

@@ -20,7 +20,6 @@ from soma_core.config.schema import register_schemas
 from soma_core.config.searchpath import register_search_path
 from soma_core.errors import InputError, SomaError
 from soma_core.plugin.declaration import did_you_mean
-from soma_core.plugin.errors import BrokenBackendError
 from soma_core.plugin.registry import default_registry
 
 __all__ = ["Task", "run_task"]
@@ -113,17 +112,12 @@ def _in_our_words(error: HydraException) -> SomaError:
 
 def _missing_choice(error: MissingConfigException) -> SomaError:
     group, _, choice = (error.missing_cfg_file or "").rpartition("/")
+    registry = default_registry()
+    clash = registry.config_clashes().get(f"{error.missing_cfg_file}.yaml")
+    if clash is not None:
+        return clash
     if group == "backend":
-        try:
-            spec = default_registry().spec(choice)
-        except SomaError as reason:
-            return reason
-        return BrokenBackendError(
-            who=f'backend "{spec.name}"',
-            stage="config",
-            cause=f"its package ships no configs/backend/{spec.name}.yaml",
-            fix="Add the file to the plugin (keys: name, params, options) and install it again",
-        )
+        return registry.missing_config(choice)
     options = list(error.options or ())
     return InputError(
         group or "configuration",

@@ -1,17 +1,19 @@
-"""Checks on what a plugin hands over: its declaration, its options and its generator."""
+"""Checks on what a plugin hands over: its declaration and its conformance checks."""
 
 from __future__ import annotations
 
 import dataclasses
 import difflib
+import math
 import re
-from collections.abc import Iterable, Mapping
-from typing import Any, get_args
+from collections.abc import Iterable
+from numbers import Real
+from pathlib import Path
+from typing import Any, get_args, get_type_hints
 
-from soma_core.errors import InputError
 from soma_core.plugin.spec import Axis, BackendSpec, FileNeeded, Parameter, Unit, WrapPair
 
-__all__ = ["checked_options", "checks_problem", "did_you_mean", "spec_problem"]
+__all__ = ["checks_problem", "did_you_mean", "spec_problem"]
 
 _NAME = re.compile(r"[A-Za-z_][A-Za-z0-9_-]*")
 
@@ -38,28 +40,68 @@ def _params_problem(params: object) -> str | None:
     twice = sorted({name for name in names if names.count(name) > 1})
     if twice:
         return f"params declares {', '.join(twice)} more than once"
-    for item in params:
-        if not _NAME.fullmatch(item.name):
-            return f"the parameter name {item.name!r} is no key; use letters, digits, _ and -"
-        if not item.range[0] < item.range[1]:
-            return f"the range of parameter {item.name} is {item.range}, expected (low, high) with low < high"
+    return next(filter(None, map(_parameter_problem, params)), None)
+
+
+def _parameter_problem(item: Parameter) -> str | None:
+    if not (isinstance(item.name, str) and _NAME.fullmatch(item.name)):
+        return f"the parameter name {item.name!r} is no key; use letters, digits, _ and -"
+    if not (isinstance(item.shape, tuple) and all(isinstance(n, int) and n >= 0 for n in item.shape)):
+        return f"the shape of parameter {item.name} is {item.shape!r}, expected a tuple of sizes like (10,)"
+    if not (isinstance(item.range, tuple) and len(item.range) == 2 and all(map(_is_finite, item.range))):
+        return f"the range of parameter {item.name} is {item.range!r}, expected two finite numbers"
+    if not item.range[0] < item.range[1]:
+        return f"the range of parameter {item.name} is {item.range}, expected (low, high) with low < high"
+    if not _is_finite(item.default):
+        return f"the default of parameter {item.name} is {item.default!r}, expected a finite number"
     return None
 
 
+def _is_finite(value: object) -> bool:
+    return isinstance(value, Real) and not isinstance(value, bool) and math.isfinite(value)
+
+
 def _parts_problem(spec: BackendSpec) -> str | None:
+    if not isinstance(spec.api, int) or isinstance(spec.api, bool):
+        return f"api is {spec.api!r}, expected the whole number of a contract version"
+    for key in ("licence", "url", "description"):
+        if not isinstance(getattr(spec, key), str):
+            return f"{key} is {getattr(spec, key)!r}, expected a text"
+    segments = spec.fill_segments
+    if not (isinstance(segments, tuple) and all(isinstance(name, str) for name in segments)):
+        return f"fill_segments is {segments!r}, expected a tuple of names"
+    return _paths_problem(spec) or _options_problem(spec.options)
+
+
+def _paths_problem(spec: BackendSpec) -> str | None:
     if not (spec.wrap is None or isinstance(spec.wrap, WrapPair)):
         return f"wrap is {spec.wrap!r}, expected a WrapPair or None"
     if not (isinstance(spec.files, tuple) and all(isinstance(item, FileNeeded) for item in spec.files)):
         return f"files is {spec.files!r}, expected a tuple of FileNeeded"
-    if not (
-        spec.options is None or (isinstance(spec.options, type) and dataclasses.is_dataclass(spec.options))
-    ):
-        return f"options is {spec.options!r}, expected a dataclass type or None"
+    paths: list[tuple[str, object]] = [("files", item.path) for item in spec.files]
+    if spec.wrap:
+        paths += [("wrap.native", spec.wrap.native), ("wrap.wrap", spec.wrap.wrap)]
+    wrong = next(((key, path) for key, path in paths if not isinstance(path, Path)), None)
+    return f"{wrong[0]} names {wrong[1]!r}, expected a pathlib.Path" if wrong else None
+
+
+def _options_problem(options: Any) -> str | None:
+    if options is None:
+        return None
+    if not (isinstance(options, type) and dataclasses.is_dataclass(options)):
+        return f"options is {options!r}, expected a dataclass type or None"
+    try:
+        get_type_hints(options)
+    except (NameError, TypeError, SyntaxError) as error:
+        return f"the annotations of {options.__name__} cannot be read ({error}); import what they name"
     return None
 
 
 def spec_problem(spec: object, name: str) -> str | None:
-    """Say what is wrong with the declaration of backend `name`, or return None when it is sound."""
+    """Say what is wrong with the declaration of backend `name`, or return None when it is sound.
+
+    The version of the contract is the registry's to judge.
+    """
     if not isinstance(spec, BackendSpec):
         return f"soma_backend returned {type(spec).__name__}, expected BackendSpec"
     if spec.name != name:
@@ -82,26 +124,3 @@ def checks_problem(checks: Iterable[object]) -> str | None:
         if not (isinstance(getattr(check, "id", None), str) and callable(getattr(check, "run", None))):
             return f"soma_checks gave {check!r:.80}, expected a soma_core.testing.Check"
     return None
-
-
-def checked_options(spec: BackendSpec, options: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the options with the defaults of ``spec.options`` filled in.
-
-    The dataclass may refuse values in its ``__post_init__``. Its fields are passed on by name.
-
-    Raises:
-        InputError: an option that the backend does not declare.
-    """
-    fields = [field.name for field in dataclasses.fields(spec.options)] if spec.options else []
-    for key, value in options.items():
-        if key not in fields:
-            raise InputError(
-                f"backend.options.{key}",
-                got=repr(value),
-                expected=f"one of the options of backend {spec.name!r}: {', '.join(fields) or 'it has none'}",
-                fix=did_you_mean(key, fields) or "Leave it out",
-            )
-    if spec.options is None:
-        return {}
-    made = spec.options(**options)
-    return {name: getattr(made, name) for name in fields}

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.metadata
 import importlib.util
+import logging
 import re
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
@@ -15,6 +16,8 @@ from soma_core.plugin.hookspecs import ENTRY_POINT_GROUP
 __all__ = ["CORE_PACKAGE", "EntryPointLike", "Offer", "config_folder", "find_offers"]
 
 CORE_PACKAGE = "soma_core"
+
+_log = logging.getLogger(__name__)
 
 
 class EntryPointLike(Protocol):
@@ -58,6 +61,11 @@ class Offer:
         """Top-level package of the plugin."""
         return re.split(r"[.:]", self.target, maxsplit=1)[0]
 
+    @property
+    def source(self) -> str:
+        """Who offers it, as messages name it: distribution and version."""
+        return f"{self.distribution} {self.version}".strip()
+
 
 def _normalised(distribution: str) -> str:
     """Spelling of a distribution name that pip treats as equal (PEP 503)."""
@@ -70,12 +78,10 @@ def find_offers(entry_points: Iterable[EntryPointLike] | None = None) -> dict[st
     A distribution seen twice (an editable install beside a stale wheel) counts once: the first on
     ``sys.path`` wins, as it does for imports. More than one offer under a name is a conflict.
     """
-    if entry_points is None:
-        entry_points = importlib.metadata.entry_points(group=ENTRY_POINT_GROUP)
     found: dict[tuple[str, str], Offer] = {}
-    for point in entry_points:
-        distribution = point.dist.name if point.dist is not None else "unknown distribution"
-        version = point.dist.version if point.dist is not None else ""
+    for point in _installed() if entry_points is None else entry_points:
+        distribution = getattr(point.dist, "name", None) or "unknown distribution"
+        version = getattr(point.dist, "version", None) or ""
         offer = Offer(
             name=point.name, distribution=distribution, version=version, target=point.value, load=point.load
         )
@@ -84,6 +90,23 @@ def find_offers(entry_points: Iterable[EntryPointLike] | None = None) -> dict[st
     for (name, _), offer in sorted(found.items()):
         grouped[name] = (*grouped.get(name, ()), offer)
     return grouped
+
+
+def _installed() -> Iterable[EntryPointLike]:
+    """Entry points of our group; where one distribution's metadata is damaged, those of all others."""
+    try:
+        return importlib.metadata.entry_points(group=ENTRY_POINT_GROUP)
+    except Exception as error:  # whatever a damaged file makes of the standard library's parser
+        _log.debug("reading the distributions one by one: %r", error)
+    points: dict[str, Iterable[EntryPointLike]] = {}
+    for distribution in importlib.metadata.distributions():
+        try:
+            found = distribution.entry_points.select(group=ENTRY_POINT_GROUP)
+            points.setdefault(_normalised(distribution.name or ""), found)
+        except Exception as error:
+            where = distribution.locate_file("")
+            _log.warning("the metadata of %s in %s is damaged (%r)", distribution.name, where, error)
+    return [point for several in points.values() for point in several]
 
 
 def config_folder(offer: Offer) -> Path | None:

@@ -12,12 +12,30 @@ __all__ = [
     "BackendError",
     "BackendWarning",
     "BrokenBackendError",
+    "PluginError",
     "Stage",
     "UnknownBackendError",
 ]
 
-Stage = Literal["lookup", "import", "hooks", "spec", "files", "build", "wrap", "config"]
-"""How far the backend came: found by name, imported, hooks read, declaration checked, files there, built."""
+Stage = Literal["lookup", "import", "hooks", "spec", "files", "build", "wrap", "rest", "config"]
+"""How far a backend came.
+
+lookup: found by name; import: its module loaded; hooks: its functions registered and called; spec: its
+declaration checked; files: what the user must supply is there; build: the generator made; wrap: its
+vertices tied to the canonical mesh; rest: a body generated; config: its hydra files composed.
+"""
+
+
+class PluginError(SomaError):
+    """What is wrong with a plugin, said before it is known whose it is.
+
+    The registry turns it into a :class:`BackendError`, which adds the backend, its distribution and the
+    stage. Without a `fix` the registry names the usual one.
+    """
+
+    def __init__(self, cause: str, *, fix: str = "") -> None:
+        self.cause, self.fix = cause, fix
+        super().__init__(f"{cause}. {fix}".strip())
 
 
 class BackendError(SomaError):

@@ -4,40 +4,44 @@ from __future__ import annotations
 
 import functools
 import os
+import shlex
 import warnings
 from collections.abc import Iterable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-import pluggy
-
-from soma_core.errors import InputError
-from soma_core.plugin import hookspecs
-from soma_core.plugin.declaration import checked_options, checks_problem, did_you_mean, spec_problem
-from soma_core.plugin.discovery import CORE_PACKAGE, EntryPointLike, Offer, config_folder, find_offers
+from soma_core import __version__
+from soma_core.errors import AssetError, InputError
+from soma_core.plugin.configs import PluginConfigs, find_configs
+from soma_core.plugin.declaration import checks_problem, did_you_mean, spec_problem
+from soma_core.plugin.discovery import EntryPointLike, Offer, find_offers
 from soma_core.plugin.errors import (
     BackendConflictError,
     BackendDisabledError,
     BackendError,
     BackendWarning,
     BrokenBackendError,
+    PluginError,
     Stage,
     UnknownBackendError,
 )
+from soma_core.plugin.hooks import hook_manager
+from soma_core.plugin.installation import core_requirement, editable_folder, reinstall_command
 from soma_core.plugin.known import KNOWN_BACKENDS, install_line, publication
-from soma_core.plugin.spec import API_VERSION, BackendSpec, Generator
+from soma_core.plugin.options import checked_options
+from soma_core.plugin.spec import API_VERSION, OLDEST_API_VERSION, BackendSpec, Generator
 
 if TYPE_CHECKING:
+    import pluggy
     import torch
 
     from soma_core.testing import Check
 
-__all__ = ["OLDEST_API_VERSION", "Entry", "Registry", "State", "default_registry"]
+__all__ = ["Entry", "Registry", "State", "default_registry"]
 
-OLDEST_API_VERSION = 1
-"""Oldest version of the plugin contract that this core still speaks."""
+_CORE = f"soma-body-core {__version__}"
 
 State = Literal["found", "declared", "built", "blocked", "conflict", "broken"]
 
@@ -66,8 +70,7 @@ class _Record:
     who: str = field(init=False)
 
     def __post_init__(self) -> None:
-        sources = " and ".join(f"{offer.distribution} {offer.version}".strip() for offer in self.offers)
-        self.who = f'backend "{self.name}" ({sources})'
+        self.who = f'backend "{self.name}" ({" and ".join(offer.source for offer in self.offers)})'
 
 
 class Registry:
@@ -164,11 +167,7 @@ class Registry:
                 spec=spec, device=device, dtype=dtype, options=checked
             )
             if not callable(getattr(generator, "rest", None)):
-                raise _broken(
-                    record,
-                    "build",
-                    f"soma_generator returned {type(generator).__name__} without a rest method",
-                )
+                raise PluginError(f"soma_generator returned {type(generator).__name__} without a rest method")
         record.state, record.error = "built", None
         return generator
 
@@ -185,20 +184,46 @@ class Registry:
             found = tuple(check for given in record.manager.hook.soma_checks() for check in given)
             problem = checks_problem(found)
             if problem is not None:
-                raise _broken(record, "hooks", problem)
+                raise PluginError(problem)
         return found
 
+    def isolated(self, name: str, stage: Stage) -> AbstractContextManager[None]:
+        """Return a context that turns whatever is raised inside into an error of backend `name`.
+
+        For the stages that lie outside the registry: ``wrap`` and ``rest``. Ctrl-C passes, and so does an
+        InputError at ``build`` and ``rest``, which is about what the caller asked for. SOMA_STRICT=1 lets
+        everything pass as it is.
+        """
+        return _isolated(self._record(name), stage)
+
     def config_dirs(self) -> tuple[tuple[str, Path], ...]:
-        """Return (distribution, folder) of each plugin that ships hydra configs, importing none of them."""
-        found: dict[Path, str] = {}
-        for record in self._records.values():
-            offer = record.offers[0]
-            if record.state in ("blocked", "conflict") or offer.package == CORE_PACKAGE:
-                continue
-            folder = config_folder(offer)
-            if folder is not None:
-                found.setdefault(folder, offer.distribution)
-        return tuple((distribution, folder) for folder, distribution in found.items())
+        """Return (distribution, folder) of each plugin that ships hydra configs, importing none of them.
+
+        Left out are blocked and conflicting backends, and plugins that ship a file of the same name.
+        """
+        return self._configs.folders
+
+    def config_clashes(self) -> Mapping[str, BackendConflictError]:
+        """Return why a config such as ``backend/acme.yaml`` is not among :meth:`config_dirs`."""
+        return self._configs.clashes
+
+    def missing_config(self, name: str) -> BackendError:
+        """Return why hydra finds no ``backend/<name>.yaml``: no such backend, or its package lacks the file."""
+        try:
+            self.spec(name)
+        except BackendError as reason:
+            return reason
+        return BrokenBackendError(
+            who=self._records[name].who,
+            stage="config",
+            cause=f"its package ships no configs/backend/{name}.yaml",
+            fix="Add the file to the plugin (keys: name, params, options) and install it again",
+        )
+
+    @functools.cached_property
+    def _configs(self) -> PluginConfigs:
+        usable = [record for record in self._records.values() if record.state not in ("blocked", "conflict")]
+        return find_configs((record.offers[0] for record in usable), core=_CORE)
 
     def _settle(self, record: _Record) -> None:
         """Set aside what cannot be used whatever its plugin says."""
@@ -232,85 +257,98 @@ class Registry:
 
     def _declare(self, record: _Record) -> None:
         """Import the plugin, register its hooks with a manager of its own, and check its declaration."""
-        manager = pluggy.PluginManager(hookspecs.PROJECT)
-        manager.add_hookspecs(hookspecs)
         with _isolated(record, "import"):
             plugin = record.offers[0].load()
         with _isolated(record, "hooks"):
-            manager.register(plugin, name=record.name)
-            manager.check_pending()
-            for hook in (manager.hook.soma_backend, manager.hook.soma_generator):
-                if not hook.get_hookimpls():
-                    raise _broken(record, "hooks", f"the plugin does not implement the hook {hook.name}")
-        with _isolated(record, "hooks"):
+            manager = hook_manager(plugin, record.name)
             spec = manager.hook.soma_backend()
         with _isolated(record, "spec"):
             problem = spec_problem(spec, record.name)
             if problem is not None:
-                raise _broken(record, "spec", problem)
-            _check_api(record, spec)
+                raise PluginError(problem)
+            _check_api(record.offers[0], spec)
         record.manager, record.spec, record.state = manager, spec, "declared"
+        if spec.api < API_VERSION:
+            fix = f"Run: {reinstall_command(record.offers[0].distribution)}"
+            warnings.warn(f"{record.who}: spec: {_spoken(spec)}. {fix}", BackendWarning, stacklevel=4)
 
     def _check_files(self, record: _Record, spec: BackendSpec) -> None:
         for needed in spec.files:
-            if not needed.path.exists():
-                source = f" Get it from {needed.url}" if needed.url else ""
-                raise _broken(
-                    record,
-                    "files",
-                    f"{needed.description or 'a file'} is missing at {needed.path}",
-                    fix=f"Put the file there.{source}",
-                )
+            with _isolated(record, "files"):
+                if not needed.path.exists():
+                    source = f" Get it from {needed.url}" if needed.url else ""
+                    raise PluginError(
+                        f"{needed.description or 'a file'} is missing at {needed.path}",
+                        fix=f"Put the file there.{source}",
+                    )
         for path in (spec.wrap.native, spec.wrap.wrap) if spec.wrap else ():
-            if not path.is_file():
-                raise _broken(record, "wrap", f"the wrap pair names {path}, which does not exist")
+            with _isolated(record, "wrap"):
+                if not path.is_file():
+                    raise PluginError(f"the wrap pair names {path}, which does not exist")
 
 
-def _reinstall(record: _Record) -> str:
+def _remedy(record: _Record, stage: Stage) -> str:
+    """What to do about a plugin that says nothing better itself."""
     distribution = record.offers[0].distribution
-    return f"Run: pip install --upgrade {distribution} (SOMA_STRICT=1 shows the whole traceback)"
+    checkout = editable_folder(distribution)
+    if stage == "rest":
+        todo = f"Compare the parameters with: soma backends show {record.name}"
+    elif checkout is None or stage == "import":  # an import often fails for want of another distribution
+        todo = f"Run: {reinstall_command(distribution)}"
+    else:
+        todo = f"Correct the plugin in {checkout}"
+    return f"{todo} (SOMA_STRICT=1 shows the whole traceback)"
 
 
-def _broken(record: _Record, stage: Stage, cause: str, *, fix: str = "") -> BrokenBackendError:
-    """Mark `record` as broken at `stage` and return the error that says so."""
-    error = BrokenBackendError(
-        who=record.who, stage=stage, cause=cause.rstrip(". "), fix=fix or _reinstall(record)
-    )
-    record.state, record.error = "broken", error
-    return error
+def _cause_and_fix(error: BaseException) -> tuple[str, str]:
+    """What an exception says: the core's own errors bring a fix along, others none."""
+    if isinstance(error, InputError):
+        return f"{error.argument}: got {error.got}, expected {error.expected}", error.fix
+    if isinstance(error, AssetError):
+        return f"{error.path}: {error.cause}", error.fix
+    if isinstance(error, BackendError | PluginError):
+        return error.cause, error.fix
+    try:
+        text = " ".join(str(error).split())
+    except Exception:  # an exception of the plugin's own, whose text cannot be made
+        text = ""
+    return f"{type(error).__name__}: {text}" if text else type(error).__name__, ""
 
 
 @contextmanager
 def _isolated(record: _Record, stage: Stage) -> Iterator[None]:
-    """Turn whatever the plugin raises at `stage` into an error of this backend.
-
-    Ctrl-C stays Ctrl-C, and an InputError while building passes: it is about what the user asked for.
-    """
+    """Turn whatever is raised at `stage` into the error of this record; see :meth:`Registry.isolated`."""
     try:
         yield
-    except (KeyboardInterrupt, GeneratorExit):
+    except KeyboardInterrupt:
         raise
     except BaseException as error:
-        ours = error is record.error or (stage == "build" and isinstance(error, InputError))
-        if ours or os.environ.get("SOMA_STRICT") == "1":
+        if error is record.error:
             raise
-        raise _broken(record, stage, f"{type(error).__name__}: {error}") from error
-
-
-def _check_api(record: _Record, spec: BackendSpec) -> None:
-    """Accept the contract versions that this core speaks; warn about the older ones."""
-    spoken = f"this core speaks {OLDEST_API_VERSION} to {API_VERSION}"
-    if spec.api > API_VERSION:
-        cause = f"written for plugin api {spec.api}, {spoken}"
-        raise _broken(record, "spec", cause, fix="Run: pip install --upgrade soma-body-core")
-    if spec.api < OLDEST_API_VERSION:
-        raise _broken(record, "spec", f"written for plugin api {spec.api}, {spoken}")
-    if spec.api < API_VERSION:
-        warnings.warn(
-            f"{record.who}: written for plugin api {spec.api}, {spoken}. {_reinstall(record)}",
-            BackendWarning,
-            stacklevel=5,
+        about_the_call = isinstance(error, InputError) and stage in ("build", "rest")
+        own_words = isinstance(error, PluginError)
+        if about_the_call or (os.environ.get("SOMA_STRICT") == "1" and not own_words):
+            raise
+        cause, fix = _cause_and_fix(error)
+        record.state = "broken"
+        record.error = BrokenBackendError(
+            who=record.who, stage=stage, cause=cause.rstrip(". "), fix=fix or _remedy(record, stage)
         )
+        raise record.error from (None if own_words else error)
+
+
+def _spoken(spec: BackendSpec) -> str:
+    versions = f"{OLDEST_API_VERSION} to {API_VERSION}" if OLDEST_API_VERSION < API_VERSION else API_VERSION
+    return f"written for plugin api {spec.api}; {_CORE} speaks {versions}"
+
+
+def _check_api(offer: Offer, spec: BackendSpec) -> None:
+    """Accept the contract versions that this core speaks."""
+    if spec.api > API_VERSION:
+        requirement = core_requirement(offer.distribution)
+        raise PluginError(_spoken(spec), fix=f"Run: pip install --upgrade {shlex.quote(requirement)}")
+    if spec.api < OLDEST_API_VERSION:
+        raise PluginError(_spoken(spec), fix=f"Run: {reinstall_command(offer.distribution)}")
 
 
 def default_registry() -> Registry:

@@ -12,6 +12,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "API_VERSION",
+    "OLDEST_API_VERSION",
     "Axis",
     "BackendSpec",
     "FileNeeded",
@@ -25,7 +26,10 @@ __all__ = [
 ]
 
 API_VERSION = 1
-"""Version of the plugin contract that this core speaks."""
+"""Newest version of the plugin contract that this core speaks."""
+
+OLDEST_API_VERSION = 1
+"""Oldest version of the plugin contract that this core still speaks."""
 
 Unit = Literal["m", "cm", "mm"]
 Axis = Literal["+x", "-x", "+y", "-y", "+z", "-z"]
@@ -81,7 +85,7 @@ class BackendSpec:
 
     Attributes:
         name: entry-point name, ``backend=<name>`` and ``configs/backend/<name>.yaml``.
-        api: version of the contract the plugin was written for.
+        api: version of the contract the plugin was written for; 1 where the plugin does not say.
         unit: unit of the generator's vertices and of the wrap pair.
         up, forward: the generator's axes. The body's left is ``up x forward``.
         wrap: the OBJ pair in the generator's unit; ``None`` when the native topology is the
@@ -102,7 +106,7 @@ class BackendSpec:
     forward: Axis
     params: tuple[Parameter, ...]
     wrap: WrapPair | None
-    api: int = API_VERSION
+    api: int = 1  # stays 1 when the contract moves on: a plugin that says nothing was written for the first
     wrap_up: Axis | None = None
     wrap_forward: Axis | None = None
     fill_segments: tuple[str, ...] = ()

@@ -60,7 +60,10 @@ def test_a_plugin_brings_its_config(
 
 
 def test_a_plugin_without_a_config_is_told_what_to_add(registry: Registry, tmp_path: Path) -> None:
-    with pytest.raises(BrokenBackendError, match='"bare": config: .*ships no configs/backend/bare.yaml'):
+    with pytest.raises(
+        BrokenBackendError,
+        match=r'"bare" \(soma-backend-bare 1.0\): config: .*ships no configs/backend/bare.yaml',
+    ):
         _compose(tmp_path, "backend=bare")
 
 
