@@ -2,6 +2,7 @@
 
 import json
 import struct
+import tracemalloc
 import zipfile
 
 import numpy as np
@@ -13,6 +14,9 @@ from soma_core.io.vertex_files import open_vertex_sequence
 
 FILE_TOLERANCE_MM = 0.01
 """Float32 positions within four metres of the origin, skinned in float32."""
+
+MEMORY_BYTES = 2**20
+"""Ten chunks of four frames of 2,000 vertices: what the reader may hold while it goes through a hundred."""
 
 FRAMES, COUNT = 7, 5
 
@@ -175,6 +179,20 @@ def test_missing_files_pointers_and_other_suffixes_are_named(tmp_path):
     (tmp_path / "a.fbx").write_bytes(b"x")
     with pytest.raises(InputError, match=r"a\.fbx: got the suffix '\.fbx', expected \.npz"):
         open_vertex_sequence(tmp_path / "a.fbx")
+
+
+def test_memory_does_not_grow_with_the_length(tmp_path):
+    frames = np.random.default_rng(0).normal(size=(400, 2000, 3)).astype(np.float32)  # 9.6 MB
+    np.savez_compressed(tmp_path / "long.npz", vertices=frames)
+    np.save(tmp_path / "long.npy", frames)
+    for name in ("long.npz", "long.npy"):
+        tracemalloc.start()
+        with open_vertex_sequence(tmp_path / name) as sequence:
+            for start in range(0, 400, 4):
+                sequence.read(start, start + 4)
+        peak = tracemalloc.get_traced_memory()[1]
+        tracemalloc.stop()
+        assert peak < MEMORY_BYTES, name
 
 
 def test_a_folder_is_read_in_natural_order(tmp_path, vertices):
