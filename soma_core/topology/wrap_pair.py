@@ -9,7 +9,15 @@ import numpy as np
 from soma_core.errors import AssetError, InputError
 from soma_core.rig.mesh import CanonicalMesh
 
-__all__ = ["check_wrap", "read_obj", "refuse_unreadable"]
+__all__ = [
+    "canonical_edges",
+    "check_count",
+    "check_faces",
+    "check_order",
+    "check_wrap",
+    "read_obj",
+    "refuse_unreadable",
+]
 
 _LFS = b"version https://git-lfs"
 
@@ -84,6 +92,12 @@ def _fan(fields: list[str], count: int) -> list[tuple[int, int, int]]:
     return [(ids[0], ids[i], ids[i + 1]) for i in range(1, len(ids) - 1)]
 
 
+def canonical_edges(mesh: CanonicalMesh) -> tuple[np.ndarray, np.ndarray]:
+    """Both ends (e,) of every polygon edge, each edge once."""
+    edges = _canonical_edges(mesh)
+    return edges >> 32, edges & 0xFFFFFFFF
+
+
 def _canonical_edges(mesh: CanonicalMesh) -> np.ndarray:
     """Polygon edges as sorted, unique 64-bit keys."""
     starts = np.concatenate([[0], np.cumsum(mesh.face_vert_counts)[:-1]])
@@ -100,6 +114,13 @@ def _edge_keys(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 def check_wrap(vertices: np.ndarray, triangles: np.ndarray, mesh: CanonicalMesh, *, path: Path) -> None:
     """Refuse a wrap of another vertex count, or whose vertices are not in canonical order."""
+    check_count(vertices, mesh, path=path)
+    check_faces(triangles, mesh, path=path)
+    check_order(vertices, mesh, path=path)
+
+
+def check_count(vertices: np.ndarray, mesh: CanonicalMesh, *, path: Path) -> None:
+    """Refuse a wrap of another vertex count."""
     if len(vertices) != mesh.vertex_count:
         raise InputError(
             f"wrap {path}",
@@ -107,6 +128,10 @@ def check_wrap(vertices: np.ndarray, triangles: np.ndarray, mesh: CanonicalMesh,
             expected=f"{mesh.vertex_count}, one for each canonical vertex",
             fix="Export the wrap without merging, splitting or removing vertices.",
         )
+
+
+def check_faces(triangles: np.ndarray, mesh: CanonicalMesh, *, path: Path) -> None:
+    """Refuse faces that are no part of a canonical polygon; its diagonals are free."""
     canonical = _canonical_edges(mesh)
     keys = [_edge_keys(triangles[:, i], triangles[:, j]) for i, j in ((0, 1), (1, 2), (2, 0))]
     on_edges = sum(np.isin(key, canonical).astype(int) for key in keys)
@@ -118,12 +143,11 @@ def check_wrap(vertices: np.ndarray, triangles: np.ndarray, mesh: CanonicalMesh,
             expected="the canonical vertex order and faces",
             fix="Export again, vertex order kept (Blender: Keep Vertex Order; trimesh: process=False).",
         )
-    _refuse_long_edges(vertices, mesh, canonical, path)
 
 
-def _refuse_long_edges(vertices: np.ndarray, mesh: CanonicalMesh, edges: np.ndarray, path: Path) -> None:
+def check_order(vertices: np.ndarray, mesh: CanonicalMesh, *, path: Path) -> None:
     """Catch a permutation applied to vertices and not to faces: neighbours would lie far apart."""
-    start, end = edges >> 32, edges & 0xFFFFFFFF
+    start, end = canonical_edges(mesh)
 
     def relative(points: np.ndarray) -> float:
         diagonal = float(np.linalg.norm(np.ptp(points, axis=0))) or 1.0
