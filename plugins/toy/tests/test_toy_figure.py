@@ -1,4 +1,4 @@
-"""The figure is sound: closed capsules, proportions that do what their names say, files of that very shape."""
+"""The figure is sound: closed capsules, proportions that do what they say, files of that very shape."""
 
 from __future__ import annotations
 
