@@ -13,13 +13,16 @@ from typing import TYPE_CHECKING
 
 from soma_core import __version__
 from soma_core.errors import InputError, SomaError
+from soma_core.tasks import EXIT_BACKEND, EXIT_FAILED, EXIT_OK, EXIT_USAGE
 
 if TYPE_CHECKING:
     from soma_core.config.compose import Task
 
 __all__ = ["EXIT_BACKEND", "EXIT_FAILED", "EXIT_OK", "EXIT_USAGE", "TASKS", "TaskRow", "console", "main"]
 
-EXIT_OK, EXIT_FAILED, EXIT_USAGE, EXIT_BACKEND, EXIT_INTERRUPTED = 0, 1, 2, 3, 130
+EXIT_INTERRUPTED = 130
+EXIT_PIPE = 141
+"""What a shell reports for a program whose reader went away, as in ``soma --help | head -1``."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -61,7 +64,7 @@ def _usage() -> str:
     return "\n".join(
         [
             "usage: soma <task> [key=value ...]",
-            "       soma backends [list | show NAME] [--json]",
+            "       soma backends [list | show NAME | check NAME | new NAME] [--json]",
             "       soma assets [build | verify | path]",
             "       soma --version",
             "",
@@ -97,28 +100,7 @@ def _shown(folder: Path) -> str:
 
 
 def _backends(arguments: Sequence[str]) -> int:
-    from soma_core.plugin import listing
-    from soma_core.plugin.registry import default_registry
-
-    parser = argparse.ArgumentParser(
-        prog="soma backends", description="What is installed, and in what state."
-    )
-    parser.add_argument("--json", action="store_true", help="machine-readable output")
-    verbs = parser.add_subparsers(dest="verb")
-    for verb, summary in (("list", "all backends (the default)"), ("show", "the declaration of one")):
-        one = verbs.add_parser(verb, help=summary)
-        one.add_argument("--json", action="store_true", default=argparse.SUPPRESS)
-        if verb == "show":
-            one.add_argument("name")
-    options = parser.parse_args(arguments)
-    registry = default_registry()
-    if options.verb == "show":
-        spec = registry.spec(options.name)
-        _say(listing.spec_json(spec) if options.json else listing.spec_text(spec))
-    else:
-        entries = registry.entries()
-        _say(listing.entries_json(entries) if options.json else listing.entries_text(entries))
-    return EXIT_OK
+    return importlib.import_module("soma_core.tasks.backends").run_verb(arguments, _say)
 
 
 def _assets(arguments: Sequence[str]) -> int:
@@ -198,4 +180,16 @@ def main(arguments: Sequence[str]) -> int:
 
 def console() -> None:
     """Entry point of the console script."""
-    sys.exit(main(sys.argv[1:]))
+    try:
+        code: int | str | None = main(sys.argv[1:])
+    except SystemExit as stop:  # hydra and argparse end the process once they have printed their help
+        code = stop.code
+    except BrokenPipeError:
+        code = EXIT_PIPE
+    try:
+        sys.stdout.flush()
+    except BrokenPipeError:
+        code = EXIT_PIPE
+    if code == EXIT_PIPE:  # the interpreter flushes once more at its end; let it have somewhere to write
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    sys.exit(code)

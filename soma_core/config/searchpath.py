@@ -7,6 +7,7 @@ from hydra.core.plugins import Plugins
 from hydra.plugins.search_path_plugin import SearchPathPlugin
 
 from soma_core.paths import configs_dir
+from soma_core.plugin.discovery import CORE_DISTRIBUTION
 from soma_core.plugin.registry import default_registry
 
 __all__ = ["SomaSearchPath", "register_search_path"]
@@ -17,7 +18,7 @@ class SomaSearchPath(SearchPathPlugin):
 
     def manipulate_search_path(self, search_path: ConfigSearchPath) -> None:
         """Add one entry a distribution; hydra takes the first that holds a config."""
-        search_path.append(provider="soma-body-core", path=f"file://{configs_dir()}")
+        search_path.append(provider=CORE_DISTRIBUTION, path=f"file://{configs_dir()}")
         for distribution, folder in default_registry().config_dirs():
             search_path.append(provider=distribution, path=f"file://{folder}")
 

@@ -13,9 +13,17 @@ from typing import Any, Protocol
 
 from soma_core.plugin.hookspecs import ENTRY_POINT_GROUP
 
-__all__ = ["CORE_PACKAGE", "EntryPointLike", "Offer", "config_folder", "find_offers"]
+__all__ = [
+    "CORE_DISTRIBUTION",
+    "CORE_PACKAGE",
+    "EntryPointLike",
+    "Offer",
+    "config_folder",
+    "find_offers",
+    "normalised",
+]
 
-CORE_PACKAGE = "soma_core"
+CORE_DISTRIBUTION, CORE_PACKAGE = "soma-body-core", "soma_core"
 
 _log = logging.getLogger(__name__)
 
@@ -67,7 +75,7 @@ class Offer:
         return f"{self.distribution} {self.version}".strip()
 
 
-def _normalised(distribution: str) -> str:
+def normalised(distribution: str) -> str:
     """Spelling of a distribution name that pip treats as equal (PEP 503)."""
     return re.sub(r"[-_.]+", "-", distribution).lower()
 
@@ -85,7 +93,7 @@ def find_offers(entry_points: Iterable[EntryPointLike] | None = None) -> dict[st
         offer = Offer(
             name=point.name, distribution=distribution, version=version, target=point.value, load=point.load
         )
-        found.setdefault((point.name, _normalised(distribution)), offer)
+        found.setdefault((point.name, normalised(distribution)), offer)
     grouped: dict[str, tuple[Offer, ...]] = {}
     for (name, _), offer in sorted(found.items()):
         grouped[name] = (*grouped.get(name, ()), offer)
@@ -102,7 +110,7 @@ def _installed() -> Iterable[EntryPointLike]:
     for distribution in importlib.metadata.distributions():
         try:
             found = distribution.entry_points.select(group=ENTRY_POINT_GROUP)
-            points.setdefault(_normalised(distribution.name or ""), found)
+            points.setdefault(normalised(distribution.name or ""), found)
         except Exception as error:
             where = distribution.locate_file("")
             _log.warning("the metadata of %s in %s is damaged (%r)", distribution.name, where, error)

@@ -9,14 +9,16 @@ import shlex
 from urllib.parse import urlsplit
 from urllib.request import url2pathname
 
-__all__ = ["core_requirement", "editable_folder", "reinstall_command"]
+from soma_core.plugin.discovery import CORE_DISTRIBUTION
+
+__all__ = ["core_requirement", "editable_folder", "local_source", "reinstall_command"]
 
 _CORE = re.compile(
     r"soma[-_.]body[-_.]core(?![-_.\w])\s*(?:\[[^]]*])?\s*\(?(?P<versions>[^;)]*)", re.IGNORECASE
 )
 
 
-def _local_source(distribution: str) -> tuple[str, bool] | None:
+def local_source(distribution: str) -> tuple[str, bool] | None:
     """Folder or file that pip installed from, and whether it is editable; None: an index, or not by pip."""
     try:
         text = importlib.metadata.distribution(distribution).read_text("direct_url.json")
@@ -30,13 +32,13 @@ def _local_source(distribution: str) -> tuple[str, bool] | None:
 
 def editable_folder(distribution: str) -> str | None:
     """Return the checkout that an editable install points to, or None."""
-    source = _local_source(distribution)
+    source = local_source(distribution)
     return source[0] if source and source[1] else None
 
 
 def reinstall_command(distribution: str) -> str:
     """Return the pip line that installs `distribution` again from where it came, with what it needs."""
-    source = _local_source(distribution)
+    source = local_source(distribution)
     if source is None:
         return f"pip install --upgrade {distribution}"
     path, editable = source
@@ -50,4 +52,4 @@ def core_requirement(distribution: str) -> str:
     except importlib.metadata.PackageNotFoundError:
         lines = []
     found = next(filter(None, map(_CORE.match, lines)), None)
-    return "soma-body-core" + (found["versions"].strip() if found else "")
+    return CORE_DISTRIBUTION + (found["versions"].strip() if found else "")

@@ -3,12 +3,18 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
 
-from soma_core.plugin.registry import Entry
-from soma_core.plugin.spec import BackendSpec, Parameter
+from soma_core.paths import configs_dir
+from soma_core.plugin.discovery import CORE_PACKAGE, config_folder
+from soma_core.plugin.errors import BackendError
+from soma_core.plugin.installation import local_source
+from soma_core.plugin.options import option_rows
+from soma_core.plugin.registry import Entry, Registry
+from soma_core.plugin.spec import BackendSpec
 
-__all__ = ["entries_json", "entries_text", "spec_json", "spec_text"]
+__all__ = ["declaration", "declaration_text", "entries_json", "entries_text", "error_document"]
 
 
 def _aligned(rows: Sequence[Sequence[str]]) -> list[str]:
@@ -20,17 +26,21 @@ def _aligned(rows: Sequence[Sequence[str]]) -> list[str]:
     ]
 
 
-def entries_text(entries: Sequence[Entry]) -> str:
-    """One line a backend, and below it what is wrong with it."""
+def entries_text(entries: Sequence[Entry], notes: Iterable[BackendError] = ()) -> str:
+    """One line a backend with its state, then each error once; `notes` are errors of no single backend."""
     if not entries:
         return "no backends are installed"
     rows = [("BACKEND", "STATE", "DISTRIBUTION", "VERSION")]
-    rows += [(entry.name, entry.state, entry.distribution, entry.version) for entry in entries]
-    lines = _aligned(rows)
-    for entry in entries:
-        if entry.error is not None and str(entry.error) not in lines:
-            lines.append(str(entry.error))
+    rows += [(entry.name, _state(entry), entry.distribution, entry.version) for entry in entries]
+    errors = [str(entry.error) for entry in entries if entry.error] + [str(note) for note in notes]
+    lines = _aligned(rows) + [line for error in dict.fromkeys(errors) for line in ("", error)]
+    if any(entry.state == "found" for entry in entries):
+        lines += ["", "found: not imported yet; soma backends --load tries each one"]
     return "\n".join(lines)
+
+
+def _state(entry: Entry) -> str:
+    return f"broken ({entry.error.stage})" if entry.state == "broken" and entry.error else entry.state
 
 
 def entries_json(entries: Sequence[Entry]) -> str:
@@ -42,9 +52,7 @@ def entries_json(entries: Sequence[Entry]) -> str:
                 "state": entry.state,
                 "distribution": entry.distribution,
                 "version": entry.version,
-                "error": None
-                if entry.error is None
-                else {"stage": entry.error.stage, "cause": entry.error.cause, "fix": entry.error.fix},
+                "error": None if entry.error is None else error_document(entry.error),
             }
             for entry in entries
         ],
@@ -52,55 +60,50 @@ def entries_json(entries: Sequence[Entry]) -> str:
     )
 
 
-def _parameter_row(item: Parameter) -> tuple[str, ...]:
-    shape = "x".join(map(str, item.shape)) or "scalar"
-    low, high = item.range
-    return ("  " + item.name, shape, f"default {item.default:g}", f"{low:g} to {high:g}", item.description)
+def error_document(error: BackendError) -> dict[str, str]:
+    """An error as JSON: stage, cause and fix."""
+    return {"stage": error.stage, "cause": error.cause, "fix": error.fix}
 
 
-def spec_text(spec: BackendSpec) -> str:
-    """The declaration of one backend: units, axes, licence, files and parameters by group."""
-    wrap = (
-        f"{spec.wrap.native} and {spec.wrap.wrap}" if spec.wrap else "none: the topology is the canonical one"
-    )
-    facts = [
-        ("backend", spec.name),
-        ("about", spec.description),
-        ("unit", spec.unit),
-        ("axes", f"{spec.up} up, {spec.forward} forward"),
-        ("licence", spec.licence),
-        ("url", spec.url),
-        ("wrap pair", wrap),
-        ("filled", ", ".join(spec.fill_segments)),
-        ("api", str(spec.api)),
-    ]
-    lines = _aligned([(key, value) for key, value in facts if value])
-    for needed in spec.files:
-        there = "found" if needed.path.exists() else f"missing, {needed.url}".rstrip(", ")
-        lines.append(f"needs {needed.description}: {needed.path} ({there})")
-    for group in dict.fromkeys(item.group for item in spec.params):
-        members = [item for item in spec.params if item.group == group]
-        lines += ["", f"{group or 'parameters'} ({len(members)})"]
-        lines += _aligned([_parameter_row(item) for item in members])
-    return "\n".join(lines)
+def declaration(registry: Registry, name: str) -> dict[str, Any]:
+    """Everything that the declaration of backend `name` says, and where it was found, ready for JSON.
 
-
-def spec_json(spec: BackendSpec) -> str:
-    """The same as one JSON object."""
-    document = {
+    Raises:
+        BackendError: the backend is unknown, blocked, in conflict, or fails to declare.
+    """
+    spec, offer = registry.spec(name), registry.offers(name)[0]
+    source = local_source(offer.distribution)
+    folder = configs_dir() if offer.package == CORE_PACKAGE else config_folder(offer)
+    clash = registry.config_clashes().get(f"backend/{name}.yaml")
+    config = folder / "backend" / f"{name}.yaml" if folder else None
+    return {
         "name": spec.name,
         "description": spec.description,
+        "distribution": offer.distribution,
+        "version": offer.version,
+        "source": source[0] if source else None,
+        "plugin": offer.target,
+        "config": str(config) if config and config.is_file() and clash is None else None,
+        "config_error": error_document(clash) if clash else None,
         "api": spec.api,
+        "licence": spec.licence,
+        "url": spec.url,
         "unit": spec.unit,
         "up": spec.up,
         "forward": spec.forward,
-        "licence": spec.licence,
-        "url": spec.url,
-        "wrap": {"native": str(spec.wrap.native), "wrap": str(spec.wrap.wrap)} if spec.wrap else None,
+        "wrap": _wrap(spec),
         "fill_segments": list(spec.fill_segments),
         "files": [
-            {"path": str(item.path), "description": item.description, "found": item.path.exists()}
+            {
+                "path": str(item.path),
+                "found": item.path.exists(),
+                "description": item.description,
+                "url": item.url,
+            }
             for item in spec.files
+        ],
+        "options": [
+            {"name": row.name, "type": row.type, "default": row.default} for row in option_rows(spec.options)
         ],
         "params": [
             {
@@ -114,4 +117,92 @@ def spec_json(spec: BackendSpec) -> str:
             for item in spec.params
         ],
     }
-    return json.dumps(document, indent=2)
+
+
+def _wrap(spec: BackendSpec) -> dict[str, Any] | None:
+    if spec.wrap is None:
+        return None
+    return {
+        "native": str(spec.wrap.native),
+        "wrap": str(spec.wrap.wrap),
+        "up": spec.wrap_up or spec.up,
+        "forward": spec.wrap_forward or spec.forward,
+        "found": spec.wrap.native.is_file() and spec.wrap.wrap.is_file(),
+        "statistics": None,
+        "error": None,
+    }
+
+
+def declaration_text(document: Mapping[str, Any]) -> str:
+    """What :func:`declaration` returned, for people: facts, then options, files and parameters."""
+    source = f", installed from {document['source']}" if document["source"] else ""
+    facts = [
+        ("backend", document["name"]),
+        ("about", document["description"]),
+        ("distribution", f"{document['distribution']} {document['version']}{source}"),
+        ("plugin", f"{document['plugin']} (api {document['api']})"),
+        ("config", document["config"] or _told(document["config_error"]) or "none: only for Python"),
+        ("licence", document["licence"]),
+        ("url", document["url"]),
+        ("unit", document["unit"]),
+        ("axes", f"{document['up']} up, {document['forward']} forward"),
+        *_wrap_facts(document),
+    ]
+    lines = _aligned([(key, value) for key, value in facts if value])
+    lines += _table("files that you supply", [_file_row(item) for item in document["files"]])
+    lines += _table("options (backend.options)", [_option_row(item) for item in document["options"]])
+    groups = dict.fromkeys(item["group"] for item in document["params"])
+    for group in groups:
+        rows = [_parameter_row(item) for item in document["params"] if item["group"] == group]
+        lines += _table(group or "parameters (backend.params)", rows)
+    return "\n".join(lines)
+
+
+def _told(error: Mapping[str, str] | None) -> str:
+    return f"cannot be used: {error['cause']}. {error['fix']}" if error else ""
+
+
+def _wrap_facts(document: Mapping[str, Any]) -> list[tuple[str, str]]:
+    wrap = document["wrap"]
+    filled = ", ".join(document["fill_segments"])
+    if wrap is None:
+        return [("wrap pair", "none: the vertices are those of the canonical mesh"), ("filled", filled)]
+    facts = [("native mesh", wrap["native"]), ("wrap", wrap["wrap"])]
+    if (wrap["up"], wrap["forward"]) != (document["up"], document["forward"]):
+        facts.append(("wrap axes", f"{wrap['up']} up, {wrap['forward']} forward"))
+    figures = wrap["statistics"]
+    if figures:
+        facts += [
+            ("vertices", f"{figures['native_count']} native, {figures['wrap_count']} canonical"),
+            (
+                "wrap distance",
+                f"mean {figures['mean_mm']:.2f} mm, 95 % below {figures['p95_mm']:.2f} mm, "
+                f"at most {figures['max_mm']:.2f} mm from the native surface",
+            ),
+            (
+                "wrap offset",
+                f"from {figures['lowest_mm']:+.2f} mm (inside) to {figures['highest_mm']:+.2f} mm (outside)",
+            ),
+        ]
+        filled += f" ({figures['filled_count']} vertices)" if filled else ""
+    return [*facts, ("wrap state", _told(wrap["error"])), ("filled", filled)]
+
+
+def _table(heading: str, rows: Sequence[Sequence[str]]) -> list[str]:
+    return ["", f"{heading}: {len(rows)}", *(f"  {line}" for line in _aligned(rows))] if rows else []
+
+
+def _file_row(item: Mapping[str, Any]) -> tuple[str, ...]:
+    return ("found" if item["found"] else "missing", item["path"], item["description"], item["url"])
+
+
+def _option_row(item: Mapping[str, Any]) -> tuple[str, ...]:
+    default = "must be given" if item["default"] is None else f"default {item['default']}"
+    return (item["name"], item["type"], default)
+
+
+def _parameter_row(item: Mapping[str, Any]) -> tuple[str, ...]:
+    shape = "x".join(map(str, item["shape"])) or "scalar"
+    low, high = item["range"]
+    default = f"default {item['default']:g}"
+    return (item["name"], shape, default, f"{low:g} to {high:g}", item["description"])

@@ -16,7 +16,7 @@ from soma_core import __version__
 from soma_core.errors import AssetError, InputError
 from soma_core.plugin.configs import PluginConfigs, find_configs
 from soma_core.plugin.declaration import checks_problem, did_you_mean, spec_problem
-from soma_core.plugin.discovery import EntryPointLike, Offer, find_offers
+from soma_core.plugin.discovery import CORE_DISTRIBUTION, EntryPointLike, Offer, find_offers
 from soma_core.plugin.errors import (
     BackendConflictError,
     BackendDisabledError,
@@ -41,7 +41,7 @@ if TYPE_CHECKING:
 
 __all__ = ["Entry", "Registry", "State", "default_registry"]
 
-_CORE = f"soma-body-core {__version__}"
+_CORE = f"{CORE_DISTRIBUTION} {__version__}"
 
 State = Literal["found", "declared", "built", "blocked", "conflict", "broken"]
 
@@ -208,7 +208,7 @@ class Registry:
         return self._configs.clashes
 
     def missing_config(self, name: str) -> BackendError:
-        """Return why hydra finds no ``backend/<name>.yaml``: no such backend, or its package lacks the file."""
+        """Return why hydra finds no ``backend/<name>.yaml``: no backend, or a package without the file."""
         try:
             self.spec(name)
         except BackendError as reason:

@@ -19,6 +19,7 @@ from soma_core.errors import SomaError
 from soma_core.evaluation.random_poses import random_axis_angles
 from soma_core.layer import SomaLayer
 from soma_core.shape_space.sampling import sample_parameters
+from soma_core.tasks.animate import given_params
 
 __all__ = ["run"]
 
@@ -38,7 +39,7 @@ def run(config: DictConfig, output: Path) -> None:
     backend = config.backend
     begin = time.perf_counter()
     layer = SomaLayer(
-        backend.name, options=dict(backend.options), kernels=str(config.kernels), device=config.device
+        backend.name, options=given_params(backend.options), kernels=str(config.kernels), device=config.device
     )
     construction = time.perf_counter() - begin
     _check(config, layer)
