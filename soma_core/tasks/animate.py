@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
+from omegaconf import OmegaConf
 
 from soma_core.errors import InputError
 from soma_core.io.clip import skinned_clip
@@ -111,13 +112,8 @@ def _shown_frames(frame_count: int, count: int) -> list[int]:
 
 def given_params(values: Mapping[str, Any]) -> dict[str, Any]:
     """Entries of a configuration group that hold a value; null means the default."""
-    found = {}
-    for name, value in values.items():
-        if value is not None:
-            found[str(name)] = (
-                list(value) if hasattr(value, "__iter__") and not isinstance(value, str) else value
-            )
-    return found
+    plain = OmegaConf.to_container(OmegaConf.create(values), resolve=True)
+    return {str(name): value for name, value in plain.items() if value is not None}
 
 
 def animate(
