@@ -8,7 +8,8 @@ import pytest
 
 from soma_core.errors import SomaError
 from soma_core.tasks import picture
-from soma_core.tasks.picture import Body, backend_colour, contact_sheet, gallery
+from soma_core.tasks.picture import backend_colour, contact_sheet, gallery
+from soma_core.tasks.stage import Body
 
 PIL = pytest.importorskip("PIL.Image", reason="pictures need pyvista and Pillow")
 
