@@ -30,7 +30,7 @@ RANKS = [
     {"rig", "topology", "skeleton", "animation", "correctives", "inversion"},
     {"backends", "io"},
     {"layer"},
-    {"config", "shape_space", "testing"},
+    {"config", "shape_space", "template", "testing"},
     {"evaluation"},
     {"tasks"},
     {"cli"},

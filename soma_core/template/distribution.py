@@ -1,0 +1,116 @@
+"""Write the distribution of a new backend: texts from templates, meshes from the canonical mesh."""
+
+from __future__ import annotations
+
+import keyword
+import re
+import shutil
+import string
+import tempfile
+from importlib.resources import files
+from pathlib import Path
+
+import numpy as np
+
+from soma_core.errors import InputError
+from soma_core.plugin.registry import Registry, default_registry
+from soma_core.rig import load_canonical
+
+__all__ = ["write_backend"]
+
+_NAME = re.compile(r"[a-z][a-z0-9_]*")
+_WORDS = {"all", "null", "none", "true", "false", "yes", "no", "on", "off", "nan", "inf"}
+"""Names that the command line or YAML reads as something else."""
+
+_TEMPLATES = {
+    "pyproject.toml": "pyproject.toml.in",
+    "README.md": "README.md.in",
+    "LICENSE": "LICENSE.in",
+    "$package/__init__.py": "__init__.py.in",
+    "$package/_generator.py": "_generator.py.in",
+    "$package/configs/backend/$name.yaml": "config.yaml.in",
+    "tests/test_$name.py": "test.py.in",
+    ".github/workflows/test.yml": "ci.yml.in",
+}
+"""Path in the distribution -> template in ``files/``."""
+
+
+def write_backend(name: str, folder: Path | str = ".", *, registry: Registry | None = None) -> Path:
+    """Write the distribution ``soma-backend-<name>`` into `folder` and return where it is.
+
+    It is a working backend around a linear model with two coefficients, in metres, +Y up, facing +Z. Its
+    native mesh is the low level of detail of the canonical mesh, and its wrap is the mid level. It appears
+    whole or not at all.
+
+    Args:
+        name: of the backend: lower-case letters, digits and underscores.
+        folder: where the new folder goes; made if need be.
+        registry: whose backends' names are taken; by default what is installed.
+
+    Raises:
+        InputError: a name that will not do or is taken, or a folder that exists.
+    """
+    _check_name(name, registry or default_registry())
+    distribution = f"soma-backend-{name.replace('_', '-')}"
+    target = Path(folder) / distribution
+    if target.exists():
+        raise InputError(
+            "folder", got=str(target), expected="a folder that does not exist yet",
+            fix="Remove it, or write the backend elsewhere.",
+        )  # fmt: skip
+    target.parent.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(dir=target.parent, prefix=f".{distribution}-") as temporary:
+        made = Path(temporary) / distribution
+        _write_texts(made, name, distribution)
+        _write_model(made / f"soma_backend_{name}")
+        shutil.move(made, target)
+    return target
+
+
+def _check_name(name: str, registry: Registry) -> None:
+    if not _NAME.fullmatch(name):
+        wish = re.sub(r"[^a-z0-9]+", "_", name.lower()).strip("_").lstrip("0123456789_")
+        raise InputError(
+            "name", got=repr(name), expected="lower-case letters, digits and underscores, a letter first",
+            fix=f'For example "{wish or "acme"}".',
+        )  # fmt: skip
+    if keyword.iskeyword(name) or name in _WORDS:
+        raise InputError(
+            "name", got=repr(name), expected="no word of Python, YAML or the command line",
+            fix=f'For example "{name}_model".',
+        )  # fmt: skip
+    for entry in registry.entries():
+        if entry.name == name:
+            raise InputError(
+                "name", got=f'"{name}", which {entry.distribution} {entry.version} offers',
+                expected="a name that no installed backend has",
+                fix=f"Choose another, or run: pip uninstall {entry.distribution}",
+            )  # fmt: skip
+
+
+def _write_texts(folder: Path, name: str, distribution: str) -> None:
+    words = name.split("_")
+    values = {
+        "name": name,
+        "package": f"soma_backend_{name}",
+        "distribution": distribution,
+        "title": " ".join(words).capitalize(),
+        "camel": "".join(word.capitalize() for word in words),
+    }
+    for path, template in _TEMPLATES.items():
+        target = folder / string.Template(path).substitute(values)
+        target.parent.mkdir(parents=True, exist_ok=True)
+        text = files(__package__).joinpath("files", template).read_text(encoding="utf-8")
+        target.write_text(string.Template(text).substitute(values), encoding="utf-8")
+
+
+def _write_model(folder: Path) -> None:
+    """Write the wrap pair and the linear model; the model's mesh is the canonical one at its low LOD."""
+    native, wrap = load_canonical("low")[0], load_canonical("mid")[0]
+    for name, mesh in (("native.obj", native), ("wrap.obj", wrap)):
+        lines = [f"v {x:.6f} {y:.6f} {z:.6f}" for x, y, z in mesh.vertices.tolist()]
+        lines += [f"f {a} {b} {c}" for a, b, c in (mesh.triangles + 1).tolist()]
+        (folder / name).write_text("\n".join(lines) + "\n", encoding="ascii")
+    template = native.vertices.round(6)
+    directions = np.stack([0.05 * template, 0.08 * template * [1, 0, 1]])
+    np.savez_compressed(folder / "model.npz", template=template, directions=directions)
