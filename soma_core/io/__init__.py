@@ -1,4 +1,4 @@
-"""Motion files, and skinned animations as UsdSkel and glTF."""
+"""Motion files, vertices over time, and skinned animations as UsdSkel and glTF."""
 
 from __future__ import annotations
 
@@ -6,18 +6,23 @@ from soma_core.io.clip import SkinnedClip, skinned_clip
 from soma_core.io.gltf import write_gltf
 from soma_core.io.joint_order import USER_JOINTS
 from soma_core.io.motion import Convention, Motion
-from soma_core.io.motion_files import check_rig, read_motion, write_motion
+from soma_core.io.motion_files import check_rig, read_motion, write_motion, write_motion_parts
 from soma_core.io.usd import write_usd
+from soma_core.io.vertex_files import open_vertex_sequence
+from soma_core.io.vertex_sequence import VertexSequence
 
 __all__ = [
     "USER_JOINTS",
     "Convention",
     "Motion",
     "SkinnedClip",
+    "VertexSequence",
     "check_rig",
+    "open_vertex_sequence",
     "read_motion",
     "skinned_clip",
     "write_gltf",
     "write_motion",
+    "write_motion_parts",
     "write_usd",
 ]

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+import zipfile
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Literal
 
@@ -18,7 +19,10 @@ from soma_core.io.motion import Convention, Motion
 from soma_core.io.npz_fields import check_rotations, open_npz
 from soma_core.io.soma_npz import SCHEMA_VERSION, read_soma_npz
 
-__all__ = ["check_rig", "read_motion", "write_motion"]
+__all__ = ["check_rig", "read_motion", "write_motion", "write_motion_parts"]
+
+_LONG = {"poses": "rotations", "transl": "translation"}
+"""Keys of a file that hold an entry a frame, and the field of a motion that they come from."""
 
 
 def read_motion(
@@ -76,6 +80,79 @@ def write_motion(
     Raises:
         InputError: the joints are not the 77 user joints in order, or a matrix is no rotation.
     """
+    _check_joints(motion)
+    check_rotations("motion.rotations", motion.rotations.astype(np.float64))
+    arrays = _arrays(motion, rotation_repr)
+    if joint_orient is not None and motion.convention == "t_pose_relative":
+        arrays["joint_orient"] = np.asarray(joint_orient, np.float32)
+    # np.savez appends .npz to other names, and the rename would then miss the file: hand it a stream.
+    atomic_write(Path(path), lambda temporary: _save(temporary, arrays))
+
+
+def write_motion_parts(
+    parts: Callable[[], Iterator[Motion]],
+    path: str | Path,
+    *,
+    frame_count: int,
+    joint_orient: np.ndarray | None = None,
+) -> None:
+    """Write a motion that is too long to hold, atomically; the file is that of ``write_motion``.
+
+    Args:
+        parts: gives consecutive pieces of the motion, from the start each time it is called; the first one
+            tells frame rate, identity and the rest.
+        path: the NPZ file.
+        frame_count: frames of all pieces together.
+        joint_orient: as in ``write_motion``.
+
+    Raises:
+        InputError: as in ``write_motion``, or the pieces do not add up.
+    """
+    first = next(parts())
+    _check_joints(first)
+    arrays = _arrays(first, "matrix")
+    if joint_orient is not None and first.convention == "t_pose_relative":
+        arrays["joint_orient"] = np.asarray(joint_orient, np.float32)
+    arrays["poses"], arrays["transl"] = arrays["poses"][:0], arrays["transl"][:0]
+
+    def write(temporary: Path) -> None:
+        with zipfile.ZipFile(temporary, "w", zipfile.ZIP_DEFLATED) as archive:
+            for name, array in arrays.items():
+                if name in _LONG:
+                    _write_long(archive, name, _pieces(parts, name), like=array, count=frame_count)
+                else:
+                    with archive.open(f"{name}.npy", "w") as stream:
+                        np.save(stream, array, allow_pickle=False)
+
+    atomic_write(Path(path), write)
+
+
+def _pieces(parts: Callable[[], Iterator[Motion]], name: str) -> Iterator[np.ndarray]:
+    """One array of every piece, checked."""
+    for part in parts():
+        if name == "poses":
+            check_rotations("motion.rotations", part.rotations.astype(np.float64))
+        yield getattr(part, _LONG[name])
+
+
+def _write_long(
+    archive: zipfile.ZipFile, name: str, pieces: Iterator[np.ndarray], *, like: np.ndarray, count: int
+) -> None:
+    """Write an array of `count` entries piece by piece; `like` tells its type and the shape of an entry."""
+    header = {"descr": like.dtype.str, "fortran_order": False, "shape": (count, *like.shape[1:])}
+    written = 0
+    with archive.open(f"{name}.npy", "w", force_zip64=True) as stream:
+        np.lib.format.write_array_header_2_0(stream, header)
+        for piece in pieces:
+            stream.write(np.ascontiguousarray(piece, like.dtype).tobytes())
+            written += len(piece)
+    if written != count:
+        raise InputError(
+            f"motion.{name}", got=f"{written} frames", expected=count, fix="Give every piece, once."
+        )
+
+
+def _check_joints(motion: Motion) -> None:
     if tuple(motion.joint_names) != USER_JOINTS:
         raise InputError(
             "motion.joint_names",
@@ -83,12 +160,6 @@ def write_motion(
             expected="the 77 user joints, Hips first",
             fix="Order the joints like soma_core.io.USER_JOINTS.",
         )
-    check_rotations("motion.rotations", motion.rotations.astype(np.float64))
-    arrays = _arrays(motion, rotation_repr)
-    if joint_orient is not None and motion.convention == "t_pose_relative":
-        arrays["joint_orient"] = np.asarray(joint_orient, np.float32)
-    # np.savez appends .npz to other names, and the rename would then miss the file: hand it a stream.
-    atomic_write(Path(path), lambda temporary: _save(temporary, arrays))
 
 
 def _save(path: Path, arrays: Mapping[str, np.ndarray]) -> None:

@@ -9,7 +9,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from soma_core.errors import AssetError, InputError
-from soma_core.io import USER_JOINTS, Motion, check_rig, read_motion, write_motion
+from soma_core.io import USER_JOINTS, Motion, check_rig, read_motion, write_motion, write_motion_parts
 from soma_core.io.joint_order import KIMODO_30_JOINTS, PARENT_NAMES, nearest_ancestors
 
 ROTVEC_TOLERANCE = 2e-6
@@ -362,6 +362,45 @@ def test_writing_refuses_what_reading_would(motion, tmp_path):
         write_motion(replace(motion, joint_names=(*USER_JOINTS[1:], "Hips")), tmp_path / "m.npz")
     with pytest.raises(InputError, match=r"motion\.identity: got list"):
         write_motion(replace(motion, identity={"backend": "a", "params": [1.0]}), tmp_path / "m.npz")
+    assert not list(tmp_path.iterdir())
+
+
+def pieces(motion, *sizes):
+    """A function that gives consecutive pieces of a motion."""
+    ends = np.cumsum(sizes)
+
+    def parts():
+        for start, end in zip([0, *ends], ends, strict=False):
+            part = slice(start, end)
+            yield replace(motion, rotations=motion.rotations[part], translation=motion.translation[part])
+
+    return parts
+
+
+def test_a_motion_in_pieces_is_the_same_file(motion, tmp_path):
+    orient = random_rotations(1, 77)[0]
+    write_motion(motion, tmp_path / "whole.npz", joint_orient=orient)
+    count = motion.frame_count
+    write_motion_parts(
+        pieces(motion, 1, count - 1), tmp_path / "m.npz", frame_count=count, joint_orient=orient
+    )
+    with np.load(tmp_path / "whole.npz") as whole, np.load(tmp_path / "m.npz") as found:
+        assert found.files == whole.files
+        for name in whole.files:
+            np.testing.assert_array_equal(found[name], whole[name], err_msg=name)
+            assert found[name].dtype == whole[name].dtype
+
+
+def test_pieces_that_do_not_fit_are_refused(motion, tmp_path):
+    count = motion.frame_count
+    with pytest.raises(InputError, match=rf"motion\.poses: got {count - 1} frames, expected {count}"):
+        write_motion_parts(pieces(motion, 1, count - 2), tmp_path / "m.npz", frame_count=count)
+    skewed = replace(motion, rotations=2 * motion.rotations)
+    with pytest.raises(InputError, match=r"motion\.rotations: got \|RᵀR - I\| = 3"):
+        write_motion_parts(pieces(skewed, count), tmp_path / "m.npz", frame_count=count)
+    shuffled = replace(motion, joint_names=(*USER_JOINTS[1:], "Hips"))
+    with pytest.raises(InputError, match=r"motion\.joint_names: got 77 names that start with \('Spine1'"):
+        write_motion_parts(pieces(shuffled, count), tmp_path / "m.npz", frame_count=count)
     assert not list(tmp_path.iterdir())
 
 

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from soma_core.errors import AssetError, InputError
+from soma_core.io import open_vertex_sequence
 from soma_core.io.gltf import write_gltf
-from soma_core.io.vertex_files import open_vertex_sequence
 
 FILE_TOLERANCE_MM = 0.01
 """Float32 positions within four metres of the origin, skinned in float32."""

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from soma_core.errors import AssetError, InputError
+from soma_core.io import open_vertex_sequence
 from soma_core.io.usd import write_usd
-from soma_core.io.vertex_files import open_vertex_sequence
 
 pytest.importorskip("pxr", reason="usd-core is not installed")
 
