@@ -1,0 +1,31 @@
+"""The checks of the core, by subject; their order is the order of reports."""
+
+from __future__ import annotations
+
+from soma_core.testing.check import Check
+from soma_core.testing.checks import (
+    behaviour,
+    body,
+    declaration,
+    generator,
+    installation,
+    parameters,
+    skeleton,
+    transfer,
+    wrap,
+)
+
+__all__ = ["CORE_CHECKS"]
+
+CORE_CHECKS: tuple[Check, ...] = (
+    *declaration.CHECKS,
+    *installation.CHECKS,
+    *wrap.CHECKS,
+    *generator.CHECKS,
+    *behaviour.CHECKS,
+    *parameters.CHECKS,
+    *body.CHECKS,
+    *transfer.CHECKS,
+    *skeleton.CHECKS,
+)
+"""Every check of the core. Ids are stable: suites name them in ``expected_failures``."""

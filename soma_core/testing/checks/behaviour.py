@@ -1,0 +1,99 @@
+"""Checks of the generator as a function: the same input gives the same body and nothing else changes."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import torch
+from torch import Tensor
+
+from soma_core.plugin.spec import Generator
+from soma_core.testing.check import CheckFailedError, check
+from soma_core.testing.context import Context
+from soma_core.testing.global_state import changes, snapshot
+
+__all__ = ["CHECKS"]
+
+_SAME_M = 1e-9
+"""Metres. The same float64 sums in another order, on bodies of two metres."""
+
+
+def _rest(generator: Generator, params: Mapping[str, Tensor]) -> Tensor:
+    """Generate from copies, so that a generator which writes to its input disturbs no other call."""
+    with torch.no_grad():
+        return generator.rest({name: value.clone() for name, value in params.items()}).clone()
+
+
+def _compare(context: Context, found: Tensor, expected: Tensor, where: str, fix: str) -> None:
+    distance = context.metres * (found - expected).norm(dim=-1)
+    if not distance.max() <= _SAME_M:
+        raise CheckFailedError(
+            f"{where}, native vertex {int(distance.argmax()) % distance.shape[-1]}",
+            got=f"a body {1000 * float(distance.max()):.3g} mm away",
+            expected=f"the same body to {1000 * _SAME_M:.0e} mm",
+            fix=fix,
+        )
+
+
+def _no_parameters(context: Context) -> str:
+    return "" if context.parameters else "the backend has no parameters"
+
+
+@check("deterministic", needs=("generator-device", "finite"))
+def deterministic(context: Context) -> None:
+    """Equal parameters give equal bodies, whatever was generated before."""
+    first, other = (context.random_params(2, seed=seed) or context.default_params() for seed in (1, 2))
+    generator = context.new_generator()
+    body = _rest(generator, first)
+    fix = "Keep no state between calls and draw no random numbers."
+    _compare(context, _rest(generator, first), body, "rest() called again", fix)
+    second = _rest(generator, other)
+    _compare(context, _rest(generator, first), body, "rest() called again after other parameters", fix)
+    _compare(context, _rest(context.new_generator(), other), second, "rest() of a new generator", fix)
+
+
+@check("batch-invariant", needs=("deterministic",), unless=_no_parameters)
+def batch_invariant(context: Context) -> None:
+    """Each body of a batch is the one it would be alone."""
+    params = context.random_params()
+    bodies = _rest(context.generator, params)
+    fix = "Treat the rows of a batch apart: no statistics, sorting or shared result over the first dimension."
+    for row in range(len(bodies)):
+        alone = _rest(context.generator, {name: value[row : row + 1] for name, value in params.items()})
+        _compare(context, bodies[row : row + 1], alone, f"random body {row} in a batch of {len(bodies)}", fix)
+
+
+@check("inputs-unchanged", needs=("generator-device",), unless=_no_parameters)
+def inputs_unchanged(context: Context) -> None:
+    """The generator leaves the tensors that it is given as they are."""
+    params = context.random_params()
+    given = {name: value.clone() for name, value in params.items()}
+    with torch.no_grad():
+        context.generator.rest(given)
+    for name, value in params.items():
+        if name not in given or not torch.equal(given[name], value):
+            raise CheckFailedError(
+                f"params[{name!r}] after rest()",
+                got="nothing" if name not in given else "other values",
+                expected="the values that were passed",
+                fix="Work on a new tensor or a copied dictionary instead of writing in place.",
+            )
+
+
+@check("no-global-state", needs=("generator-device",))
+def no_global_state(context: Context) -> None:
+    """Building and generating leave what is global in the process alone."""
+    before = snapshot()
+    with torch.no_grad():
+        context.new_generator().rest(context.default_params())
+    changed = changes(before)
+    if changed:
+        raise CheckFailedError(
+            "the process after building and generating",
+            got=f"a change of {', '.join(changed)}",
+            expected="everything as before: other backends share the process",
+            fix="Pass dtype, device and a torch.Generator of your own instead of setting what is global.",
+        )
+
+
+CHECKS = (deterministic, batch_invariant, inputs_unchanged, no_global_state)

@@ -1,0 +1,116 @@
+"""Checks of the declaration: what a backend says about itself before anything is built."""
+
+from __future__ import annotations
+
+import math
+
+from soma_core.plugin.options import checked_options
+from soma_core.testing.check import CheckFailedError, check
+from soma_core.testing.context import Context
+from soma_core.topology.transfer import filled_vertices
+
+__all__ = ["CHECKS"]
+
+
+@check("declares", level="core")
+def declares(context: Context) -> None:
+    """The plugin imports, implements the hooks and declares a backend."""
+    context.registry.spec(context.name)
+
+
+@check("licence", level="core", needs=("declares",))
+def licence(context: Context) -> None:
+    """The declaration states the licence of the model."""
+    if not context.spec.licence.strip():
+        raise CheckFailedError(
+            "BackendSpec.licence",
+            got=repr(context.spec.licence),
+            expected="the licence of the model and its data, by SPDX id or in words",
+            fix='State it, for example licence="CC-BY-NC-4.0".',
+        )
+
+
+@check("described", level="core", needs=("declares",))
+def described(context: Context) -> None:
+    """The backend and each parameter are described in one line."""
+    texts = {"BackendSpec.description": context.spec.description}
+    texts |= {f"description of the parameter {item.name}": item.description for item in context.spec.params}
+    for where, text in texts.items():
+        if not text.strip() or "\n" in text:
+            raise CheckFailedError(
+                where,
+                got=f"{text!r:.60}",
+                expected="one line for people, which `soma backends show` prints",
+                fix="Say what it changes, and what the ends of its range mean.",
+            )
+
+
+@check("parameter-defaults", level="core", needs=("declares",))
+def parameter_defaults(context: Context) -> None:
+    """Every parameter has a finite range with its default inside."""
+    for item in context.spec.params:
+        low, high = item.range
+        if not (math.isfinite(low) and math.isfinite(high) and low <= item.default <= high):
+            raise CheckFailedError(
+                f"parameter {item.name}",
+                got=f"default {item.default:g} and range {low:g} to {high:g}",
+                expected="a finite range with the default inside",
+                fix="Correct default or range: sampling and the checks stay inside the range.",
+            )
+        if any(size < 1 for size in item.shape):
+            raise CheckFailedError(
+                f"parameter {item.name}",
+                got=f"shape {item.shape}",
+                expected="sizes of at least 1; () for a scalar",
+                fix="Correct the shape, or leave out a parameter that holds nothing.",
+            )
+
+
+def _no_options(context: Context) -> str:
+    return "" if context.spec.options else "the backend has no options"
+
+
+@check("options", level="core", needs=("declares",), unless=_no_options)
+def options(context: Context) -> None:
+    """Every option has a default: the backend works by its name alone."""
+    checked_options(context.spec, {})
+
+
+@check("fill-segments", level="core", needs=("declares",))
+def fill_segments(context: Context) -> None:
+    """The segments to fill exist on the canonical mesh."""
+    filled_vertices(context.spec, context.mesh)
+
+
+def _no_files(context: Context) -> str:
+    return "" if context.spec.files else "the backend needs no files of the user"
+
+
+@check("files-named", level="core", needs=("declares",), unless=_no_files)
+def files_named(context: Context) -> None:
+    """Each file that the user must supply has a path and a source."""
+    for needed in context.spec.files:
+        parts = {
+            "an absolute path": needed.path.is_absolute(),
+            "a description": bool(needed.description.strip()),
+            "a url": bool(needed.url.strip()),
+        }
+        missing = [part for part, there in parts.items() if not there]
+        if missing:
+            raise CheckFailedError(
+                f"FileNeeded {needed.path}",
+                got=f"no {', no '.join(part.partition(' ')[2] for part in missing)}",
+                expected=", ".join(parts),
+                fix="Add it: the message about a missing file tells the user where to get it and put it.",
+            )
+
+
+@check("own-checks", level="core", needs=("declares",))
+def own_checks(context: Context) -> None:
+    """The hook soma_checks, where there is one, gives sound checks."""
+    context.registry.checks(context.name)
+
+
+CHECKS = (
+    declares, licence, described, parameter_defaults, options, fill_segments, files_named, own_checks,
+)  # fmt: skip

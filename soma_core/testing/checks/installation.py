@@ -1,0 +1,123 @@
+"""Checks of what is installed: the import and the configuration."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from hydra import compose, initialize_config_dir
+from hydra.errors import HydraException
+from omegaconf import DictConfig, OmegaConf
+
+from soma_core.config.schema import register_schemas
+from soma_core.paths import configs_dir
+from soma_core.plugin.discovery import CORE_PACKAGE
+from soma_core.plugin.options import checked_options
+from soma_core.testing.check import CheckFailedError, check
+from soma_core.testing.context import Context
+from soma_core.testing.import_probe import probe_import
+
+__all__ = ["CHECKS"]
+
+_HEAVY = ("torch", "warp", "pxr", "trimesh", "jax", "tensorflow")
+"""Packages that take a second or more to import; listing and `soma --help` must not pay for them."""
+
+
+@check("import-light", level="core", needs=("declares",))
+def import_light(context: Context) -> None:
+    """Importing and declaring loads no heavy library."""
+    probe = probe_import(context.offer)
+    loaded = [name for name in _HEAVY if name in probe.packages]
+    if probe.error or loaded:
+        raise CheckFailedError(
+            f"import of {context.offer.target}",
+            got=probe.error or f"an import of {', '.join(loaded)}",
+            expected=f"a declaration that imports none of {', '.join(_HEAVY)}",
+            fix="Import them inside soma_generator, or under `if TYPE_CHECKING:` for annotations.",
+        )
+
+
+@check("import-silent", level="core", needs=("declares",))
+def import_silent(context: Context) -> None:
+    """Importing and declaring writes nothing and warns of nothing."""
+    output = probe_import(context.offer).output
+    if output:
+        raise CheckFailedError(
+            f"import of {context.offer.target}",
+            got=f"the output {output.splitlines()[0]!r:.100}",
+            expected="nothing on stdout or stderr, no warnings",
+            fix="Take the output out, or use logging inside soma_generator.",
+        )
+
+
+def _composed(context: Context) -> DictConfig:
+    """Group ``backend`` as ``backend=<name>`` on the command line composes it."""
+    name, registry = context.name, context.registry
+    folders = [str(folder) for _, folder in registry.config_dirs()]
+    clash = registry.config_clashes().get(f"backend/{name}.yaml")
+    if clash is not None:
+        raise clash
+    if context.offer.package != CORE_PACKAGE and not any(
+        (folder / "backend" / f"{name}.yaml").is_file() for _, folder in registry.config_dirs()
+    ):
+        raise registry.missing_config(name)
+    register_schemas()
+    paths = ", ".join(f"'file://{folder}'" for folder in folders)
+    with initialize_config_dir(version_base="1.3", config_dir=str(configs_dir())):
+        overrides = [f"backend={name}", f"hydra.searchpath=[{paths}]"]
+        return compose("animate", overrides=overrides).backend
+
+
+@check("config-composes", level="core", needs=("declares",))
+def config_composes(context: Context) -> None:
+    """The package ships configs/backend/<name>.yaml, and hydra composes it."""
+    where = f"configs/backend/{context.name}.yaml"
+    try:
+        name = _composed(context).name
+    except HydraException as error:
+        raise CheckFailedError(
+            where,
+            got=f"{' '.join(str(error).split()):.200}",
+            expected="a file with the keys name, params and options",
+            fix="Correct the file.",
+        ) from error
+    if name != context.name:
+        raise CheckFailedError(
+            where, got=f"name: {name}", expected=f"name: {context.name}", fix="Correct the file."
+        )
+
+
+@check("config-complete", level="core", needs=("config-composes", "options"))
+def config_complete(context: Context) -> None:
+    """The config lists every parameter and option, with the defaults of Python."""
+    config = OmegaConf.to_container(_composed(context))
+    assert isinstance(config, dict)
+    options = checked_options(context.spec, {})
+    _compare(context, "params", config["params"], {item.name: item.default for item in context.spec.params})
+    _compare(context, "options", config["options"], options)
+
+
+def _compare(context: Context, key: str, found: dict[str, Any], declared: dict[str, Any]) -> None:
+    where = f"configs/backend/{context.name}.yaml: {key}"
+    missing = [name for name in declared if name not in found]
+    strange = [name for name in found if name not in declared]
+    if missing or strange:
+        parts = [f"no {', '.join(missing)}"] * bool(missing) + [f"undeclared {', '.join(strange)}"] * bool(
+            strange
+        )
+        raise CheckFailedError(
+            where,
+            got=f"{'; '.join(parts):.200}",
+            expected=f"the {len(declared)} declared names",
+            fix="List each of them: the command line sets no key that the file lacks.",
+        )
+    for name, value in found.items():
+        if value is not None and value != declared[name] and str(value) != str(declared[name]):
+            raise CheckFailedError(
+                f"{where}.{name}",
+                got=repr(value),
+                expected=f"{declared[name]!r}, the default in Python, or null",
+                fix="Make them equal, so that the command line and Python give one body.",
+            )
+
+
+CHECKS = (import_light, import_silent, config_composes, config_complete)

@@ -1,0 +1,127 @@
+"""Checks of the fitted skeleton and of poses."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from soma_core.geometry.rotations import orthonormality_error
+from soma_core.testing.check import CheckFailedError, check
+from soma_core.testing.context import Context
+from soma_core.testing.samples import at_range_ends, changed_rows
+
+__all__ = ["CHECKS"]
+
+_OUTSIDE = 0.01
+"""How far outside the surface a joint may lie, relative to stature: 17 mm of 1.7 m, a finger."""
+
+_ROTATION = 1e-6
+"""Largest entry of |R^T R - I|, float64: far above rounding, far below what a pose shows."""
+
+_BONE_DEG = 20.0
+"""Degrees. Other proportions spread hips and palm by up to ten; a wrong joint by far more."""
+_SHORT_BONE = 0.01
+"""Bones shorter than this part of the stature have no direction worth comparing."""
+
+_CHUNK = 8
+"""Bodies prepared at a time, to bound memory."""
+
+
+def _winding(points: np.ndarray, vertices: np.ndarray, triangles: np.ndarray) -> np.ndarray:
+    """How often a surface winds around each point: 1 inside, 0 outside; (p, 3) -> (p,).
+
+    Sum of signed solid angles (van Oosterom and Strackee 1983) over 4 pi; small holes hardly change it.
+    """
+    total = np.empty(len(points))
+    for index, point in enumerate(points):
+        a, b, c = (vertices[triangles[:, corner]] - point for corner in range(3))
+        la, lb, lc = (np.linalg.norm(edge, axis=1) for edge in (a, b, c))
+        volume = np.einsum("ij,ij->i", a, np.cross(b, c))
+        spread = la * lb * lc + (a * b).sum(1) * lc + (b * c).sum(1) * la + (c * a).sum(1) * lb
+        total[index] = np.arctan2(volume, spread).sum() / (2 * np.pi)
+    return total
+
+
+@check("joints-inside", needs=("transfer-random",))
+def joints_inside(context: Context) -> None:
+    """Joints that lie inside the canonical body lie inside every body."""
+    mesh, rig = context.mesh, context.rig
+    triangles = mesh.triangles[~np.isin(mesh.triangles, mesh.face_interior).any(1)]
+    inner = np.flatnonzero(_winding(rig.bind_world[:, :3, 3], mesh.vertices, triangles) > 0.5)
+    identity = context.bodies.identity
+    for row, (body, world) in enumerate(
+        zip(identity.fitted_rest.numpy(), identity.fitted_world.numpy(), strict=True)
+    ):
+        places = world[inner, :3, 3]
+        for joint in inner[_winding(places, body, triangles) < 0.5]:
+            away = float(np.linalg.norm(body - world[joint, :3, 3], axis=1).min())
+            if away > _OUTSIDE * np.ptp(body[:, 1]):
+                raise CheckFailedError(
+                    f"{context.bodies.label(row)}, joint {rig.joint_names[joint]}",
+                    got=f"a place outside the body, {1000 * away:.0f} mm from its nearest vertex",
+                    expected="a place inside, as on the canonical body",
+                    fix="Look at the wrap around this joint: its vertices must enclose the limb there.",
+                )
+
+
+def _prepared_worlds(context: Context) -> list[tuple[str, Tensor]]:
+    """Label and joint transforms (J, 4, 4), fitted and reposed, of bodies and of the ends of ranges."""
+    identity = context.bodies.identity
+    found = [
+        (context.bodies.label(row), world[row])
+        for row in range(identity.batch_size)
+        for world in (identity.fitted_world, identity.bind_world)
+    ]
+    ends = at_range_ends(context.parameters)
+    for start in range(0, len(ends), _CHUNK):
+        part = ends[start : start + _CHUNK]
+        with torch.no_grad():
+            made = context.layer.identity(changed_rows(context.parameters, part, dtype=torch.float64))
+        for row, change in enumerate(part):
+            found += [(f"the body at {change}", world[row]) for world in (made.fitted_world, made.bind_world)]
+    return found
+
+
+@check("rotations-so3", needs=("transfer-random",))
+def rotations_so3(context: Context) -> None:
+    """Fitted joint rotations are rotations, also at the ends of the ranges."""
+    for label, world in _prepared_worlds(context):
+        error = orthonormality_error(world[:, :3, :3]).nan_to_num(torch.inf)
+        error = torch.where(torch.isfinite(world).flatten(1).all(1), error, torch.inf)
+        worst = int(error.argmax())
+        if not error[worst] <= _ROTATION:
+            raise CheckFailedError(
+                f"{label}, joint {context.rig.joint_names[worst]}",
+                got=f"a matrix {float(error[worst]):.2g} away from a rotation",
+                expected=f"at most {_ROTATION:g}",
+                fix="The body collapses or explodes there: narrow the range of the parameter.",
+            )
+
+
+@check("zero-is-t-pose", level="core", needs=("stature",))
+def zero_is_t_pose(context: Context) -> None:
+    """Zero rotations give the T-pose: every bone points as on the canonical rig."""
+    rig, bodies = context.rig, context.bodies
+    turns = torch.zeros(bodies.identity.batch_size, rig.joint_count - 1, 3, dtype=torch.float64)
+    with torch.no_grad():
+        world = context.layer.pose(bodies.identity, turns).transforms.numpy()
+    for row, joint in np.ndindex(len(world), rig.joint_count):
+        parent = rig.parents[joint]
+        if parent < 1:
+            continue
+        bone = world[row, joint, :3, 3] - world[row, parent, :3, 3]
+        target = rig.t_pose_world[joint, :3, 3] - rig.t_pose_world[parent, :3, 3]
+        if np.linalg.norm(target) < _SHORT_BONE * np.ptp(context.mesh.vertices[:, 1]):
+            continue
+        angle = np.degrees(np.arctan2(np.linalg.norm(np.cross(bone, target)), bone @ target))
+        if not angle <= _BONE_DEG:
+            raise CheckFailedError(
+                f"{bodies.label(row)}, bone {rig.joint_names[parent]} to {rig.joint_names[joint]}",
+                got=f"{angle:.0f} degrees away from the T-pose",
+                expected=f"at most {_BONE_DEG:g} degrees",
+                fix="Look at the wrap around both joints: vertices there belong to another part of the body.",
+            )
+
+
+CHECKS = (joints_inside, rotations_so3, zero_is_t_pose)

@@ -1,0 +1,94 @@
+"""Checks of the wrap pair: the canonical mesh, vertex for vertex, on the native surface."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from soma_core.testing.check import CheckFailedError, check
+from soma_core.testing.context import Context
+from soma_core.topology.correspondence import build_correspondence
+from soma_core.topology.wrap_pair import canonical_edges, check_count, check_faces, check_order
+
+__all__ = ["CHECKS"]
+
+_STRAY_RATIO = 4.0
+"""A vertex this many times further from its neighbours than any on the canonical mesh was exchanged with
+another one: wraps stretch single edges, but never across the body."""
+
+_CLOSE = 0.0025
+"""Distance to the native surface, relative to the body's diagonal, that registered vertices keep: 5 mm."""
+_CLOSE_SHARE = 0.99
+"""Part of the covered vertices that must be close; nails, lips and armpits rarely are."""
+_LOOSE = 0.025
+"""What no covered vertex may exceed, relative to the diagonal: 5 cm of 2 m is another part of the body."""
+
+
+def _no_wrap(context: Context) -> str:
+    return "the native topology is the canonical one" if context.spec.wrap is None else ""
+
+
+@check("wrap-reads", level="core", needs=("declares",), unless=_no_wrap)
+def wrap_reads(context: Context) -> None:
+    """Both files of the wrap pair are there and hold a mesh."""
+    _ = context.wrap
+
+
+@check("wrap-count", level="core", needs=("wrap-reads",), unless=_no_wrap)
+def wrap_count(context: Context) -> None:
+    """The wrap has one vertex for each canonical vertex."""
+    check_count(context.wrap.vertices, context.mesh, path=context.spec.wrap.wrap)
+
+
+@check("wrap-order", level="core", needs=("wrap-count",), unless=_no_wrap)
+def wrap_order(context: Context) -> None:
+    """The wrap's vertices are in canonical order."""
+    check_order(context.wrap.vertices, context.mesh, path=context.spec.wrap.wrap)
+    edges = canonical_edges(context.mesh)
+    limit = _STRAY_RATIO * _relative_reach(context.mesh.vertices, edges).max()
+    reach = _relative_reach(context.wrap.vertices, edges)
+    worst = int(reach.argmax())
+    if reach[worst] > limit:
+        raise CheckFailedError(
+            f"wrap {context.spec.wrap.wrap}, {context.vertex(worst)}",
+            got=f"neighbours {reach[worst]:.1%} of the body's diagonal away",
+            expected=f"at most {limit:.1%}",
+            fix="The vertex took the place of another; export again with the vertex order kept.",
+        )
+
+
+def _relative_reach(points: np.ndarray, edges: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
+    """Mean distance of each vertex to its neighbours, relative to the body's diagonal, (v,)."""
+    start, end = edges
+    length = np.linalg.norm(points[start] - points[end], axis=1) / np.linalg.norm(np.ptp(points, axis=0))
+    both = np.concatenate((start, end))
+    return np.bincount(both, np.tile(length, 2), len(points)) / np.bincount(both, minlength=len(points))
+
+
+@check("wrap-faces", level="core", needs=("wrap-order",), unless=_no_wrap)
+def wrap_faces(context: Context) -> None:
+    """The wrap's faces are those of the canonical mesh."""
+    check_faces(context.wrap.triangles, context.mesh, path=context.spec.wrap.wrap)
+
+
+@check("wrap-distance", level="core", needs=("wrap-order", "fill-segments"), unless=_no_wrap)
+def wrap_distance(context: Context) -> None:
+    """The wrap lies on the native surface, filled segments apart."""
+    wrap = context.wrap
+    found = build_correspondence(wrap.native, wrap.native_triangles, wrap.vertices)
+    diagonal = float(np.linalg.norm(np.ptp(wrap.native, axis=0)))
+    distance = np.where(context.covered, found.distances, 0.0)
+    worst = int(distance.argmax())
+    close = float(np.quantile(distance[context.covered], _CLOSE_SHARE))
+    if close > _CLOSE * diagonal or distance[worst] > _LOOSE * diagonal:
+        millimetres = 1000 * context.metres
+        raise CheckFailedError(
+            f"wrap {context.spec.wrap.wrap}, {context.vertex(worst)}",
+            got=f"{millimetres * distance[worst]:.1f} mm from the native surface, and "
+            f"{_CLOSE_SHARE:.0%} of the vertices within {millimetres * close:.1f} mm",
+            expected=f"at most {millimetres * _LOOSE * diagonal:.1f} mm, and "
+            f"{millimetres * _CLOSE * diagonal:.1f} mm",
+            fix="Register the wrap again, or name the segment in fill_segments if the model lacks it.",
+        )
+
+
+CHECKS = (wrap_reads, wrap_count, wrap_order, wrap_faces, wrap_distance)

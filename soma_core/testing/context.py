@@ -1,0 +1,219 @@
+"""What the checks look at: one backend, its parts built when they are first asked for."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from soma_core.errors import InputError
+from soma_core.layer import SomaLayer
+from soma_core.plugin.discovery import Offer
+from soma_core.plugin.registry import Registry, default_registry
+from soma_core.plugin.spec import BackendSpec, Generator, Parameter
+from soma_core.rig import load_canonical
+from soma_core.rig.mesh import CanonicalMesh
+from soma_core.rig.skeleton import Rig
+from soma_core.skeleton.identity import Identity
+from soma_core.testing.samples import random_rows
+from soma_core.topology.frames import METRES, native_to_canonical
+from soma_core.topology.transfer import filled_vertices
+from soma_core.topology.wrap_pair import read_obj
+
+__all__ = ["CPU", "Bodies", "Context", "WrapMeshes"]
+
+CPU = torch.device("cpu")
+
+_RANDOM_BODIES = 4
+"""Random identities that the checks of bodies look at: enough to meet a fault that every body has."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class WrapMeshes:
+    """The two files of the wrap pair as they are: vertices (n, 3) and triangles (t, 3) each."""
+
+    native: np.ndarray
+    native_triangles: np.ndarray
+    vertices: np.ndarray
+    triangles: np.ndarray
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Bodies:
+    """Prepared identities; row 0 is the default body, the others are random.
+
+    Attributes:
+        params: parameters of each row.
+        native: native vertices (b, n, 3), native unit and axes.
+        identity: what the layer makes of the parameters.
+    """
+
+    params: Mapping[str, Tensor]
+    native: Tensor
+    identity: Identity
+
+    def label(self, row: int) -> str:
+        """How to name body `row` in a message."""
+        return "the default body" if row == 0 else f"random body {row}"
+
+
+class Context:
+    """One backend under check. Everything is in float64 on the CPU and by the torch reference.
+
+    Args:
+        name: the backend.
+        options: options that it is built with.
+        registry: where it is looked up.
+        canonical: mesh and rig; default: the shipped ones.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        *,
+        options: Mapping[str, Any] | None = None,
+        registry: Registry | None = None,
+        canonical: tuple[CanonicalMesh, Rig] | None = None,
+    ) -> None:
+        self.name, self.options = name, dict(options or {})
+        self.registry = registry or default_registry()
+        self._canonical = canonical
+
+    @property
+    def offer(self) -> Offer:
+        """Who offers the backend."""
+        return self.registry.offers(self.name)[0]
+
+    @property
+    def spec(self) -> BackendSpec:
+        """The declaration."""
+        return self.registry.spec(self.name)
+
+    @functools.cached_property
+    def canonical(self) -> tuple[CanonicalMesh, Rig]:
+        """The canonical mesh, at the LOD that wrap pairs are made for, and its rig."""
+        return self._canonical or load_canonical("mid")
+
+    @property
+    def mesh(self) -> CanonicalMesh:
+        """The canonical mesh."""
+        return self.canonical[0]
+
+    @property
+    def rig(self) -> Rig:
+        """The rig of the canonical mesh."""
+        return self.canonical[1]
+
+    @property
+    def metres(self) -> float:
+        """Length of one native unit."""
+        return METRES[self.spec.unit]
+
+    @property
+    def native_frame(self) -> np.ndarray:
+        """Matrix (3, 3) from the generator's unit and axes to metres, +Y up, +Z forward."""
+        return self.metres * native_to_canonical(self.spec.up, self.spec.forward)
+
+    @property
+    def wrap_frame(self) -> np.ndarray:
+        """The same for the wrap pair, whose axes may be declared apart."""
+        up = self.spec.wrap_up or self.spec.up
+        return self.metres * native_to_canonical(up, self.spec.wrap_forward or self.spec.forward)
+
+    @functools.cached_property
+    def wrap(self) -> WrapMeshes:
+        """The wrap pair as read from its files; only for backends that declare one."""
+        pair = self.spec.wrap
+        assert pair is not None
+        native, native_triangles = read_obj(pair.native)
+        vertices, triangles = read_obj(pair.wrap)
+        return WrapMeshes(
+            native=native, native_triangles=native_triangles, vertices=vertices, triangles=triangles
+        )
+
+    @functools.cached_property
+    def covered(self) -> np.ndarray:
+        """(v,) bool: canonical vertices that the wrap defines, all but the filled ones."""
+        covered = np.ones(self.mesh.vertex_count, bool)
+        covered[filled_vertices(self.spec, self.mesh)] = False
+        return covered
+
+    @property
+    def native_count(self) -> int:
+        """Number of vertices that the generator must return."""
+        return self.mesh.vertex_count if self.spec.wrap is None else len(self.wrap.native)
+
+    def new_generator(self, *, dtype: torch.dtype = torch.float64, device: torch.device = CPU) -> Generator:
+        """Build another generator."""
+        return self.registry.generator(self.name, device=device, dtype=dtype, options=self.options)
+
+    @functools.cached_property
+    def generator(self) -> Generator:
+        """A generator that is kept."""
+        return self.new_generator()
+
+    @functools.cached_property
+    def parameters(self) -> tuple[Parameter, ...]:
+        """Parameters that the generator takes with these options.
+
+        All without a group, and of the others those that it does not refuse by an InputError.
+        """
+        grouped = [item for item in self.spec.params if item.group]
+        if all(map(self._takes, grouped[:1])) and self._takes(*grouped):
+            return self.spec.params
+        return tuple(item for item in self.spec.params if not item.group or self._takes(item))
+
+    def _takes(self, *grouped: Parameter) -> bool:
+        given = [item for item in self.spec.params if not item.group or item in grouped]
+        try:
+            with torch.no_grad():
+                self.generator.rest(
+                    {item.name: torch.full((1, *item.shape), item.default).double() for item in given}
+                )
+        except InputError:
+            return False
+        return True
+
+    def default_params(self, count: int = 1, *, dtype: torch.dtype = torch.float64) -> dict[str, Tensor]:
+        """`count` rows of defaults of the parameters without a group."""
+        plain = [item for item in self.spec.params if not item.group]
+        return {item.name: torch.full((count, *item.shape), item.default, dtype=dtype) for item in plain}
+
+    def random_params(
+        self, count: int = _RANDOM_BODIES, *, seed: int = 0, dtype: torch.dtype = torch.float64
+    ) -> dict[str, Tensor]:
+        """`count` random identities inside the declared ranges."""
+        return random_rows(self.parameters, count, seed=seed, dtype=dtype)
+
+    @functools.cached_property
+    def layer(self) -> SomaLayer:
+        """The forward path, transferred vertex by vertex."""
+        return SomaLayer(
+            self.name, options=self.options, dtype=torch.float64, kernels="torch", exact=True,
+            canonical=self._canonical, registry=self.registry,
+        )  # fmt: skip
+
+    @functools.cached_property
+    def bodies(self) -> Bodies:
+        """The default body and random ones, transferred to the canonical mesh."""
+        params = {
+            name: torch.cat((torch.full_like(value[:1], self._default(name)), value))
+            for name, value in self.random_params().items()
+        }
+        with torch.no_grad():
+            return Bodies(
+                params=params, native=self.generator.rest(params), identity=self.layer.identity(params)
+            )
+
+    def _default(self, name: str) -> float:
+        return next(item.default for item in self.spec.params if item.name == name)
+
+    def vertex(self, index: int) -> str:
+        """How to name canonical vertex `index` in a message."""
+        segments = [name for name, ids in self.mesh.segments.items() if index in ids]
+        return f"canonical vertex {index}" + (f" ({', '.join(segments)})" if segments else "")
