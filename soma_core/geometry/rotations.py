@@ -7,6 +7,7 @@ from torch import Tensor
 
 __all__ = [
     "axis_angle_to_matrix",
+    "cayley",
     "matrix_to_axis_angle",
     "orthonormality_error",
     "shortest_arc",
@@ -47,6 +48,18 @@ def axis_angle_to_matrix(axis_angle: Tensor) -> Tensor:
         bx * z - ay, by * z + ax, 1 - bx * x - by * y,
     )  # fmt: skip
     return torch.stack(entries, -1).unflatten(-1, (3, 3))
+
+
+def cayley(vector: Tensor) -> Tensor:
+    """Cayley map: a rotation about `vector` by ``2 atan(|vector| / 2)``; (..., 3) -> (..., 3, 3).
+
+    Agrees with the exponential map to second order, is orthogonal to rounding and needs no trigonometry.
+    """
+    half = 0.5 * vector
+    factor = 2 / (1 + (half * half).sum(-1))
+    turn = skew(half)
+    eye = torch.eye(3, dtype=vector.dtype, device=vector.device)
+    return eye + factor[..., None, None] * (turn + turn @ turn)
 
 
 def matrix_to_axis_angle(matrix: Tensor) -> Tensor:

@@ -1,0 +1,64 @@
+"""Checks of what pose inversion is given, at the public boundary."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from soma_core.errors import InputError
+
+__all__ = ["check_vertices", "check_weights", "refuse_unit_error"]
+
+_UNIT_FACTORS = (1000.0, 100.0, 10.0, 0.1, 0.01, 0.001)
+
+
+def check_vertices(vertices: object, count: int, *, fix: str) -> Tensor:
+    """Return a floating tensor (F, count, 3), or refuse with `fix`."""
+    if not isinstance(vertices, Tensor) or not vertices.is_floating_point():
+        raise InputError(
+            "vertices",
+            got=getattr(vertices, "dtype", type(vertices).__name__),
+            expected="a floating torch.Tensor",
+            fix="Wrap it: torch.as_tensor(vertices).",
+        )
+    if vertices.ndim != 3 or vertices.shape[2] != 3 or (count >= 0 and vertices.shape[1] != count):
+        wanted = "n" if count < 0 else count
+        raise InputError("vertices", got=tuple(vertices.shape), expected=f"(frames, {wanted}, 3)", fix=fix)
+    return vertices
+
+
+def check_weights(weights: Tensor | None, default: Tensor, frames: int) -> Tensor:
+    """Vertex weights (1 or frames, v), not negative; `default` (v,) where none are given."""
+    if weights is None:
+        return default[None]
+    count = len(default)
+    weights = torch.as_tensor(weights, dtype=default.dtype, device=default.device)
+    if tuple(weights.shape) not in ((count,), (1, count), (frames, count)):
+        raise InputError(
+            "weights",
+            got=tuple(weights.shape),
+            expected=f"({count},) or ({frames}, {count})",
+            fix="Give one weight a canonical vertex, for all frames or for each.",
+        )
+    if not bool((weights >= 0).all()):
+        worst = float(weights[~(weights >= 0)][0])
+        raise InputError(
+            "weights",
+            got=worst,
+            expected="numbers of at least zero",
+            fix="Use 0 for vertices to leave out.",
+        )
+    return weights if weights.ndim == 2 else weights[None]
+
+
+def refuse_unit_error(scale: Tensor) -> None:
+    """Refuse a sequence whose frames are all the same power of ten too large or too small."""
+    typical = float(scale.median())
+    for factor in _UNIT_FACTORS:
+        if 0.5 < typical / factor < 2:
+            raise InputError(
+                "vertices",
+                got=f"bodies {typical:.3g} times the size of their identity",
+                expected="metres on the canonical topology, or the backend's own unit",
+                fix=f"Multiply the vertices by {1 / factor:g}.",
+            )

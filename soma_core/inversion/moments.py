@@ -1,0 +1,166 @@
+"""The skinning error as an explicit quadratic in the joint transforms.
+
+With local rest points ``b_vt`` and posed joints ``G_t = [D_t | c_t]`` a vertex is
+``y_v = sum_t w_vt G_t (b_vt; 1)``, so that ``E = sum_v o_v |y_v - x_v|^2 = <G N, G> - 2 <G, R> + const``:
+
+- ``N_tu = sum_v o_v w_vt w_vu (b_vt; 1)(b_vu; 1)^T`` knows the identity and the vertex weights only;
+- ``R_t = sum_v o_v w_vt x_v (b_vt; 1)^T`` is linear in the target, which is read once.
+
+Local points are ``b_vt = O_t Rot(B_t)^T (a_v - j_t)``: rest points about the joint, in axes aligned with the
+world at T-pose, so that ``D_t`` is the joint's turn from the T-pose and no joint orient is left.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.nn.functional import embedding_bag
+
+from soma_core.geometry.sparse import sparse_product
+from soma_core.inversion.structure import MomentStructure
+from soma_core.rig.skeleton import Rig
+from soma_core.skeleton.identity import Identity
+
+__all__ = ["RestMoments", "SkinMoments"]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class RestMoments:
+    """What a fit needs of an identity; batch i is 1, shared by all frames, or one a frame.
+
+    Attributes:
+        local: rest point of every influence about its joint, (i, e, 3) [m].
+        weight: skin weight times vertex weight of every influence, (i, e).
+        own: sums of weight times (local; 1)(local; 1)^T over each joint's influences, (i, T, 4, 4).
+        second: ``N`` of every pair of joints that share vertices, (i, p, 4, 4).
+        offsets: bone vectors in T-pose world axes, (i, J, 3) [m]; the Hips' entry is not used.
+    """
+
+    local: Tensor
+    weight: Tensor
+    own: Tensor
+    second: Tensor
+    offsets: Tensor
+
+    @property
+    def batch_size(self) -> int:
+        """Number of identities."""
+        return len(self.second)
+
+
+class SkinMoments(torch.nn.Module):
+    """Computes ``N`` and ``R`` on the influences of one rig. Sums run in float64, in fixed order.
+
+    Args:
+        structure: index lists of the rig.
+        rig: for the T-pose orientation of each joint.
+        dtype: of the results.
+        warp: read targets by the Warp twin where one identity serves all frames.
+    """
+
+    def __init__(
+        self,
+        structure: MomentStructure,
+        rig: Rig,
+        *,
+        dtype: torch.dtype,
+        device: torch.device | str,
+        warp: bool = False,
+    ) -> None:
+        super().__init__()
+        self.dtype, self.joint_count, self.warp = dtype, len(structure.joints), warp
+        orient = rig.t_pose_world[structure.joints, :3, :3]
+
+        def keep(name: str, array: np.ndarray) -> None:
+            self.register_buffer(name, torch.as_tensor(array, device=device), persistent=False)
+
+        keep("joints", structure.joints)
+        keep("orient", orient)
+        keep("influence_joint", structure.influence_joint)
+        keep("influence_vertex", structure.influence_vertex)
+        keep("influence_weight", structure.influence_weight)
+        keep("pair_influences", structure.pair_influences)
+        keep("joint_start", _starts(structure.influence_joint, len(structure.joints)))
+        keep("pair_start", _starts(structure.pair_entry, len(structure.pairs)))
+        four = structure.influence_vertex[:, None].repeat(4, 1)
+        spans = np.split(four, self.joint_start[1:-1].cpu().numpy())
+        keep("moment_col", np.concatenate([span.T.ravel() for span in spans]))
+        counts = np.diff(self.joint_start.cpu().numpy()).repeat(4)
+        keep("moment_crow", np.concatenate([[0], np.cumsum(counts)]))
+        source = np.split(np.arange(four.size).reshape(-1, 4), self.joint_start[1:-1].cpu().numpy())
+        keep("moment_order", np.concatenate([span.T.ravel() for span in source]))
+
+    def local_points(self, identity: Identity) -> Tensor:
+        """Rest points of every influence about its joint, in T-pose world axes, (i, e, 3) [m], float64."""
+        bind = identity.bind_world.double()[:, self.joints]
+        turn = self.orient @ bind[..., :3, :3].transpose(-1, -2)
+        step = identity.rest.double()[:, self.influence_vertex] - bind[:, self.influence_joint, :3, 3]
+        return (turn[:, self.influence_joint] @ step[..., None]).squeeze(-1)
+
+    def rest(self, identity: Identity, weights: Tensor, offsets: Tensor) -> RestMoments:
+        """Moments of identities under vertex weights (1 or i, v); `offsets` as in :class:`RestMoments`."""
+        local = self.local_points(identity)
+        vertex_weight = weights.double()[:, self.influence_vertex]
+        batch = max(len(local), len(vertex_weight))
+        local, vertex_weight = local.expand(batch, -1, 3), vertex_weight.expand(batch, -1)
+        weight = vertex_weight * self.influence_weight
+        second, own = [], []
+        for points, weight_v, weight_vt in zip(local, vertex_weight, weight, strict=True):
+            point = torch.cat((points, torch.ones_like(points[:, :1])), 1)
+            second.append(self._second(point * self.influence_weight[:, None], weight_v))
+            outer = point[:, :, None] * (point * weight_vt[:, None])[:, None]
+            own.append(_sum_rows(outer.flatten(1), self.joint_start).unflatten(1, (4, 4)))
+        return RestMoments(
+            local=local.to(self.dtype),
+            weight=weight.to(self.dtype),
+            own=torch.stack(own).to(self.dtype),
+            second=torch.stack(second).to(self.dtype),
+            offsets=offsets,
+        )
+
+    def _second(self, point: Tensor, vertex_weight: Tensor) -> Tensor:
+        """``N`` (p, 4, 4) of one identity from weighted points (e, 4)."""
+        first, second = self.pair_influences.unbind(1)
+        outer = point[first, :, None] * (point[second] * vertex_weight[first, None])[:, None]
+        return _sum_rows(outer.flatten(1), self.pair_start).unflatten(1, (4, 4))
+
+    def target(self, vertices: Tensor, rest: RestMoments) -> tuple[Tensor, Tensor]:
+        """``R`` (F, T, 3, 4) of targets (F, v, 3) [m] about an origin of each frame (F, 3) [m].
+
+        Vertices of zero weight must be finite. The origin keeps a body far from the world's origin as
+        precise as one near it.
+        """
+        if self.warp and rest.batch_size == 1:
+            from soma_core.kernels.skin_moments_wp import target_moments
+
+            constants = rest.weight[0], rest.local[0].contiguous(), rest.own[0, :, 3].contiguous()
+            return target_moments(self.joint_start, self.influence_vertex, *constants, vertices)
+        origin = vertices[:, self.influence_vertex[0]]
+        near = vertices.double() - origin.double()[:, None]
+        if rest.batch_size == 1:
+            return self._one_target(near, rest, 0), origin
+        frames = [self._one_target(near[f : f + 1], rest, f) for f in range(len(vertices))]
+        return torch.cat(frames), origin
+
+    def _one_target(self, vertices: Tensor, rest: RestMoments, which: int) -> Tensor:
+        """``R`` of frames that share identity number `which`."""
+        local, weight = rest.local[which].double(), rest.weight[which].double()
+        values = torch.cat((local, torch.ones_like(local[:, :1])), 1) * weight[:, None]
+        pattern = self.moment_crow, self.moment_col, values.ravel()[self.moment_order]
+        product = sparse_product(pattern, vertices.permute(1, 2, 0).flatten(1).contiguous())
+        # Rows are (joint, 4), columns (3, frame).
+        return product.view(self.joint_count, 4, 3, -1).permute(3, 0, 2, 1).to(self.dtype).contiguous()
+
+
+def _sum_rows(rows: Tensor, starts: Tensor) -> Tensor:
+    """Sums of consecutive rows, in fixed order."""
+    index = torch.arange(len(rows), device=rows.device)
+    return embedding_bag(index, rows, starts, mode="sum", include_last_offset=True)
+
+
+def _starts(sorted_ids: np.ndarray, count: int) -> np.ndarray:
+    """CSR row starts of ascending row ids."""
+    return np.searchsorted(sorted_ids, np.arange(count + 1))

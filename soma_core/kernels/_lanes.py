@@ -1,0 +1,100 @@
+"""Frames in SIMD lanes: element types and small functions of kernels that treat one group of frames a thread.
+
+Warp runs a CPU kernel one thread after the other, and its compiler does not vectorise over threads. So a
+thread takes a group of frames, and every number is a vector with one entry a frame: the compiler turns each
+operation into one SIMD instruction. On a GPU a group is one frame.
+"""
+
+import functools
+import itertools
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from types import SimpleNamespace
+
+import numpy as np
+import torch
+import warp as wp
+from torch import Tensor
+
+__all__ = ["as_lanes", "from_lanes", "in_threads", "lane_count", "lane_types", "to_lanes"]
+
+_CPU_BYTES = 64
+"""Width of the widest SIMD register of current CPUs; narrower ones take two or four instructions."""
+
+
+def lane_count(tensor: Tensor) -> int:
+    """Frames that one thread treats: as many as fit a SIMD register, one on a GPU."""
+    return 1 if tensor.is_cuda else _CPU_BYTES // tensor.element_size()
+
+
+@functools.cache
+def lane_types(scalar: str, lanes: int) -> SimpleNamespace:
+    """Element type ``vec`` of `lanes` numbers of type `scalar`, and lane-wise functions."""
+    real = getattr(wp, scalar)
+    vec = wp.types.vector(lanes, real)
+    width = lanes
+
+    @wp.func
+    def root(x: vec):
+        for c in range(width):
+            x[c] = wp.sqrt(x[c])
+        return x
+
+    @wp.func
+    def inverse_root(x: vec, floor: real):
+        for c in range(width):
+            x[c] = real(1.0) / wp.sqrt(wp.max(x[c], floor))
+        return x
+
+    @wp.func
+    def below(x: vec, bound: real):
+        """One where x < bound, else zero; NaN gives zero."""
+        for c in range(width):
+            x[c] = wp.where(x[c] < bound, real(1.0), real(0.0))
+        return x
+
+    @wp.func
+    def larger(x: vec, y: vec):
+        for c in range(width):
+            x[c] = wp.max(x[c], y[c])
+        return x
+
+    return SimpleNamespace(
+        real=real, vec=vec, lanes=lanes, root=root, inverse_root=inverse_root, below=below, larger=larger
+    )
+
+
+def to_lanes(frames: Tensor, lanes: int) -> Tensor:
+    """(F, ...) -> contiguous (groups, k, lanes), frames innermost; the last frame fills the last group."""
+    flat = frames.flatten(1)
+    missing = -len(flat) % lanes
+    if missing:
+        flat = torch.cat((flat, flat[-1:].expand(missing, -1)))
+    return flat.view(-1, lanes, flat.shape[1]).transpose(1, 2).contiguous()
+
+
+def from_lanes(groups: Tensor, count: int, shape: tuple[int, ...]) -> Tensor:
+    """Inverse of :func:`to_lanes`: (groups, k, lanes) -> contiguous (count, *shape)."""
+    return groups.transpose(1, 2).reshape(-1, groups.shape[1])[:count].reshape(count, *shape).contiguous()
+
+
+def as_lanes(groups: Tensor, types: SimpleNamespace) -> wp.array:
+    """Descriptor of (groups, k, lanes) memory as a two-dimensional array of lane vectors."""
+    assert groups.is_contiguous(), groups.stride()
+    return wp.from_torch(groups, dtype=types.vec, requires_grad=False, return_ctype=True)
+
+
+def in_threads(run: Callable[[slice], None], count: int, like: Tensor) -> None:
+    """Run consecutive parts of `count` groups in as many threads as torch uses.
+
+    Warp runs a CPU kernel on the calling thread and lets go of the interpreter meanwhile. On a GPU there is
+    one part.
+    """
+    threads = 1 if like.is_cuda else min(torch.get_num_threads(), count)
+    bounds = np.linspace(0, count, threads + 1).astype(int)
+    parts = [slice(int(a), int(b)) for a, b in itertools.pairwise(bounds)]
+    if len(parts) == 1:
+        run(parts[0])
+        return
+    with ThreadPoolExecutor(len(parts)) as pool:
+        list(pool.map(run, parts))

@@ -1,0 +1,291 @@
+"""Levenberg-Marquardt on moments in Warp: the twin of ``inversion.gauss_newton``.
+
+One thread takes a group of frames through the whole solve; nothing returns to Python between steps. All
+matrices are sparse by blocks, in the order of ``inversion.elimination``.
+"""
+
+import functools
+from collections.abc import Mapping
+
+import numpy as np
+import torch
+import warp as wp
+from torch import Tensor
+
+from soma_core.kernels._gn_assembly import Plan, assembly_functions
+from soma_core.kernels._gn_factor import factor_functions
+from soma_core.kernels._gn_tree import tree_functions
+from soma_core.kernels._lanes import as_lanes, from_lanes, in_threads, lane_count, lane_types, to_lanes
+from soma_core.kernels._runtime import launching, scalar_name
+
+__all__ = ["GaussNewtonPlan", "gauss_newton"]
+
+
+@functools.cache
+def _kernel(scalar: str, lanes: int, *, shared: bool):
+    types, tree = lane_types(scalar, lanes), tree_functions(scalar, lanes, shared=shared)
+    real, vec, frames, constants = types.real, types.vec, tree.frames, tree.constants
+    assembly, factor = assembly_functions(scalar, lanes, shared=shared), factor_functions(scalar, lanes)
+    state = _state(scalar, lanes)
+    damp, change, accept = _damp(types, state), _change(types, state), _accept(types, state)
+    module = wp.get_module(f"soma_gauss_newton_{scalar}_{lanes}_{'one' if shared else 'each'}")
+    module.options["enable_backward"] = False
+
+    @wp.kernel(module=module, enable_backward=False)
+    def solve(
+        plan: Plan, s: state, iterations: int, start_damping: real, lower: real, higher: real,
+        longest: real, tolerance: real, second: constants, offsets: constants, target: frames,
+        relative: frames, hips: frames, accepted: frames, last_step: frames,
+    ):  # fmt: skip
+        w = wp.tid()
+        for g in range(w, target.shape[0], s.turns.shape[0]):
+            for i in range(relative.shape[1]):
+                s.relative[w, i] = relative[g, i]
+                s.trial_relative[w, i] = relative[g, i]
+            for r in range(3):
+                s.hips[w, r] = hips[g, r]
+            tree.walk(w, g, plan.parents, offsets, s.relative, s.hips, s.turns, s.places)
+            change(w, plan, s.turns, s.places, s)
+            for i in range(target.shape[1]):
+                s.change[w, i] = s.trial[w, i]
+            tree.times_second(w, g, plan.pairs, second, s.change, s.residual)
+            for i in range(target.shape[1]):
+                s.residual[w, i] -= target[g, i]
+            damping = vec(start_damping)
+            count = vec(real(0.0))
+            largest = vec(real(0.0))
+            for _ in range(iterations):
+                assembly.moments(w, g, plan, second, s.turns, s.places, s.column, s.blocks, s.root)
+                assembly.finish(w, plan, s.blocks)
+                assembly.forces(w, plan, s.turns, s.places, s.residual, s.spread, s.force, s.slope)
+                damp(w, plan, damping, s)
+                factor.factorise(w, plan, s.blocks, s.carry, s.last, s.inverse)
+                factor.solve(w, plan, s.blocks, s.carry, s.last, s.inverse, s.slope)
+                largest = vec(real(0.0))
+                for k in range(plan.joint.shape[0]):
+                    x = -s.slope[w, 3 * k]
+                    y = -s.slope[w, 3 * k + 1]
+                    z = -s.slope[w, 3 * k + 2]
+                    length = types.root(wp.cw_mul(x, x) + wp.cw_mul(y, y) + wp.cw_mul(z, z))
+                    largest = types.larger(largest, length)
+                    short = wp.cw_div(vec(longest), types.larger(length, vec(longest)))
+                    tree.retract(
+                        w, plan.joint[k], plan.parent[k], wp.cw_mul(x, short), wp.cw_mul(y, short),
+                        wp.cw_mul(z, short), s.turns, s.relative, s.trial_relative,
+                    )  # fmt: skip
+                for r in range(3):
+                    s.trial_hips[w, r] = s.hips[w, r] - s.slope[w, 3 * plan.joint.shape[0] + r]
+                tree.walk(
+                    w, g, plan.parents, offsets, s.trial_relative, s.trial_hips, s.trial_turns, s.trial_places
+                )
+                change(w, plan, s.trial_turns, s.trial_places, s)
+                tree.times_second(w, g, plan.pairs, second, s.change, s.product)
+                better = accept(w, s)
+                count += better
+                damping = wp.cw_mul(damping, vec(higher) + (lower - higher) * better)
+                remaining = real(0.0)
+                for c in range(types.lanes):
+                    remaining = wp.max(remaining, largest[c])
+                if remaining < tolerance:
+                    break
+            for i in range(relative.shape[1]):
+                relative[g, i] = s.relative[w, i]
+            for r in range(3):
+                hips[g, r] = s.hips[w, r]
+            accepted[g, 0] = count
+            last_step[g, 0] = largest
+
+    return solve
+
+
+@functools.cache
+def _state(scalar: str, lanes: int):
+    """Working memory of each worker, one row a worker."""
+    frames = wp.array2d(dtype=lane_types(scalar, lanes).vec)
+
+    @wp.struct
+    class State:
+        relative: frames
+        hips: frames
+        turns: frames
+        places: frames
+        trial_relative: frames
+        trial_hips: frames
+        trial_turns: frames
+        trial_places: frames
+        trial: frames
+        residual: frames
+        change: frames
+        product: frames
+        column: frames
+        blocks: frames
+        root: frames
+        carry: frames
+        last: frames
+        inverse: frames
+        spread: frames
+        force: frames
+        slope: frames
+
+    return State
+
+
+def _damp(types, state):
+    real, vec = types.real, types.vec
+
+    @wp.func
+    def damp(w: int, plan: Plan, damping: vec, s: state):
+        """Rows of the translation, then Levenberg damping relative to the diagonal and a ridge."""
+        count = plan.joint.shape[0]
+        mass = vec(real(0.0))
+        mean = vec(real(0.0))
+        for k in range(count):
+            if plan.parent_column[k] < 0:
+                mass += s.root[w, 4 * k + 3]
+            for r in range(3):
+                s.carry[w, 9 * k + 4 * r] = vec(real(0.0))
+                mean += s.blocks[w, 12 * plan.block_start[k] + 5 * r]
+            s.carry[w, 9 * k + 1] = s.root[w, 4 * k + 2]
+            s.carry[w, 9 * k + 2] = -s.root[w, 4 * k + 1]
+            s.carry[w, 9 * k + 3] = -s.root[w, 4 * k + 2]
+            s.carry[w, 9 * k + 5] = s.root[w, 4 * k]
+            s.carry[w, 9 * k + 6] = s.root[w, 4 * k + 1]
+            s.carry[w, 9 * k + 7] = -s.root[w, 4 * k]
+        grow = vec(real(1.0)) + damping
+        ridge = (real(1e-9) / real(3 * count + 3)) * (mean + real(3.0) * mass)
+        for k in range(count):
+            for r in range(3):
+                d = 12 * plan.block_start[k] + 5 * r
+                s.blocks[w, d] = wp.cw_mul(s.blocks[w, d], grow) + ridge
+        for i in range(9):
+            s.last[w, i] = vec(real(0.0))
+        for r in range(3):
+            s.last[w, 4 * r] = wp.cw_mul(mass, grow) + ridge
+
+    return damp
+
+
+def _change(types, state):
+    frames = wp.array2d(dtype=types.vec)
+
+    @wp.func
+    def change(w: int, plan: Plan, turns: frames, places: frames, s: state):
+        """Transforms of the weighted joints into `trial`, how far they moved into `change`."""
+        for t in range(plan.weighted.shape[0]):
+            j = plan.weighted[t]
+            for r in range(3):
+                for c in range(3):
+                    s.trial[w, 12 * t + 4 * r + c] = turns[w, 9 * j + 3 * r + c]
+                    s.change[w, 12 * t + 4 * r + c] = (
+                        turns[w, 9 * j + 3 * r + c] - s.turns[w, 9 * j + 3 * r + c]
+                    )
+                s.trial[w, 12 * t + 4 * r + 3] = places[w, 3 * j + r]
+                s.change[w, 12 * t + 4 * r + 3] = places[w, 3 * j + r] - s.places[w, 3 * j + r]
+
+    return change
+
+
+def _accept(types, state):
+    real, vec, below = types.real, types.vec, types.below
+
+    @wp.func
+    def accept(w: int, s: state):
+        """Take the trial in the lanes where it lowers the energy; one there, zero elsewhere."""
+        energy = vec(real(0.0))
+        for i in range(s.change.shape[1]):
+            energy += wp.cw_mul(s.change[w, i], s.product[w, i] + real(2.0) * s.residual[w, i])
+        better = below(energy, real(0.0))
+        for i in range(s.change.shape[1]):
+            s.residual[w, i] += wp.cw_mul(better, s.product[w, i])
+        for i in range(s.relative.shape[1]):
+            s.relative[w, i] += wp.cw_mul(better, s.trial_relative[w, i] - s.relative[w, i])
+            s.turns[w, i] += wp.cw_mul(better, s.trial_turns[w, i] - s.turns[w, i])
+        for i in range(s.places.shape[1]):
+            s.places[w, i] += wp.cw_mul(better, s.trial_places[w, i] - s.places[w, i])
+        for r in range(3):
+            s.hips[w, r] += wp.cw_mul(better, s.trial_hips[w, r] - s.hips[w, r])
+        return better
+
+    return accept
+
+
+class GaussNewtonPlan:
+    """The order of work of one rig on one device.
+
+    Args:
+        lists: name -> integers, for every field of :class:`Plan`.
+    """
+
+    def __init__(self, lists: Mapping[str, np.ndarray], device: torch.device) -> None:
+        self.plan = Plan()
+        with launching(torch.empty(0, device=device)) as where:
+            for name, values in lists.items():
+                setattr(self.plan, name, wp.array(np.asarray(values, np.int32), dtype=wp.int32, device=where))
+        self.joints, self.weighted = len(lists["parents"]), len(lists["weighted"])
+        self.columns, self.slots = len(lists["joint"]), len(lists["block_row"])
+
+    def state(self, scalar: str, lanes: int, workers: int, like: Tensor):
+        """Working memory for `workers` threads."""
+        j, t, n = self.joints, 12 * self.weighted, self.columns
+        sizes = {
+            "relative": 9 * j, "hips": 3, "turns": 9 * j, "places": 3 * j,
+            "trial_relative": 9 * j, "trial_hips": 3, "trial_turns": 9 * j, "trial_places": 3 * j,
+            "trial": t, "residual": t, "change": t, "product": t, "column": 16 * j,
+            "blocks": 12 * self.slots, "root": 4 * n, "carry": 9 * n, "last": 9, "inverse": 3 * n + 3,
+            "spread": 9 * j, "force": 3 * j, "slope": 3 * n + 3,
+        }  # fmt: skip
+        types, state, memory = lane_types(scalar, lanes), _state(scalar, lanes)(), {}
+        for name, size in sizes.items():
+            memory[name] = torch.zeros(workers, size, lanes, dtype=like.dtype, device=like.device)
+            if name.endswith("turns"):
+                memory[name][:, :9:4] = 1  # the root never turns
+            setattr(state, name, wp.from_torch(memory[name], dtype=types.vec))
+        return state, memory
+
+
+def gauss_newton(
+    plan: GaussNewtonPlan, target: Tensor, second: Tensor, offsets: Tensor, relative: Tensor, hips: Tensor,
+    *, iterations: int, damping: tuple[float, float, float], longest: float, tolerance: float,
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:  # fmt: skip
+    """Refined rotations (F, J, 3, 3), Hips (F, 3) [m], accepted steps (F,) and last step (F,) [rad].
+
+    Args:
+        plan: index lists of the rig.
+        target: ``R`` (F, T, 3, 4).
+        second: ``N`` (1 or F, p, 4, 4).
+        offsets: (1 or F, J, 3) [m].
+        relative, hips: where to begin.
+        iterations, damping (start, lower, raise), longest [rad]: as in the torch twin.
+        tolerance: a group of frames is done when none of its joints is asked to turn further [rad].
+    """
+    count, scalar, lanes = len(target), scalar_name(target.dtype), lane_count(target)
+    shared = len(second) == 1 and len(offsets) == 1
+    types = lane_types(scalar, lanes)
+    groups = to_lanes(target, lanes), to_lanes(relative, lanes), to_lanes(hips, lanes)
+    if shared:
+        constants = second.reshape(1, -1).contiguous(), offsets.reshape(1, -1).contiguous()
+    else:
+        each = (second.expand(count, *second.shape[1:]), offsets.expand(count, *offsets.shape[1:]))
+        constants = tuple(to_lanes(one, lanes) for one in each)
+    outputs = [groups[0].new_empty(len(groups[0]), 1, lanes) for _ in range(2)]
+    kernel = _kernel(scalar, lanes, shared=shared)
+
+    def run(part: slice) -> None:
+        size = len(groups[0][part])
+        workers = size if target.is_cuda else 1
+        state, memory = plan.state(scalar, lanes, workers, target)
+        numbers = [wp.from_torch(one) if shared else as_lanes(one[part], types) for one in constants]
+        with launching(target) as device:
+            wp.launch(
+                kernel, dim=workers,
+                inputs=[plan.plan, state, iterations, *damping, longest, tolerance, *numbers,
+                        *(as_lanes(one[part], types) for one in (*groups, *outputs))],
+                device=device,
+            )  # fmt: skip
+        del memory
+
+    in_threads(run, len(groups[0]), target)
+    accepted, last = (from_lanes(one, count, ()) for one in outputs)
+    return (
+        from_lanes(groups[1], count, relative.shape[1:]), from_lanes(groups[2], count, (3,)), accepted, last
+    )  # fmt: skip
