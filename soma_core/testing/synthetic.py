@@ -52,7 +52,11 @@ _LIMBS = {
     "ToeBase": (0.19, 0.06, 0.09), "ToeEnd": (0.19, 0.055, 0.16),
 }  # fmt: skip
 _ALONG_ARM = {"Arm": 0.0, "ForeArm": 0.25, "Hand": 0.47}
-_FINGERS = {"Thumb": 0.03, "Index": 0.015, "Middle": 0.0, "Ring": -0.015, "Pinky": -0.03}
+_FINGERS = {
+    "Thumb": (0.03, -0.015), "Index": (0.015, 0.005), "Middle": (0.0, 0.01), "Ring": (-0.015, 0.005),
+    "Pinky": (-0.03, -0.005),
+}  # fmt: skip
+"""How far a finger lies in front of the arm's axis and above it [m]."""
 
 _CONES = (
     # from joint, to joint, radius there and here [m]
@@ -65,8 +69,8 @@ _CONES = (
 )  # fmt: skip
 _INSIDE_HEAD = np.array([0.0, 1.6, 0.0])
 _BAGS = {
-    "mouth_bag": [((0.0, 1.53, 0.1), 0.06)],
-    "eye_bags": [((0.06, 1.65, 0.08), 0.045), ((-0.06, 1.65, 0.08), 0.045)],
+    "mouth_bag": [((0.0, 1.5, 0.09), 0.05)],
+    "eye_bags": [((0.08, 1.67, 0.05), 0.045), ((-0.08, 1.67, 0.05), 0.045)],
 }
 """Segment -> spheres (centre, radius) [m]; what lies in them on the surface is pushed into the head."""
 
@@ -75,13 +79,14 @@ def _left_position(name: str) -> tuple[float, float, float]:
     """Bind position of a joint of the left side; `name` comes without the side."""
     if name in _LIMBS:
         return _LIMBS[name]
-    along, across = _ALONG_ARM.get(name, 0.0), 0.0
+    along, front, above = _ALONG_ARM.get(name, 0.0), 0.0, 0.0
     if name.startswith("Hand") and name != "Hand":
         finger = next(finger for finger in _FINGERS if finger in name)
         place = 4 if name.endswith("End") else int(name[-1]) - 1
-        along, across = 0.52 + 0.02 * place, _FINGERS[finger]
+        along, (front, above) = 0.52 + 0.02 * place, _FINGERS[finger]
     x, y, z = _LIMBS["Arm"]
-    return x + along * np.cos(_ARM_ANGLE), y - along * np.sin(_ARM_ANGLE), z + across
+    cos, sin = np.cos(_ARM_ANGLE), np.sin(_ARM_ANGLE)
+    return x + along * cos + above * sin, y - along * sin + above * cos, z + front
 
 
 @functools.cache
