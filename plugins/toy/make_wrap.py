@@ -1,8 +1,9 @@
-"""Write native.obj and wrap.obj of the toy: ``python make_wrap.py`` (about half a minute).
+"""Write native.obj and wrap.obj of the toy: ``python make_wrap.py`` (some seconds).
 
-``native.obj`` is the default figure. ``wrap.obj`` is the canonical mesh laid on it: each vertex goes to the
-closest point of the figure's outside, and the displacements are evened out between neighbours so that the
-surface does not fold where capsules meet. A body less simple needs a registration tool instead.
+``native.obj`` is the default figure: all its vertices, and the faces that do not lie inside the body.
+``wrap.obj`` is the canonical mesh laid on it: each vertex goes to the closest point of the outside, and the
+displacements are evened out between neighbours, so that the surface does not fold where capsules meet. A
+body less simple needs a registration tool instead.
 """
 
 from __future__ import annotations
@@ -32,7 +33,7 @@ def inside(points: np.ndarray, segment: Segment) -> np.ndarray:
 
 
 def outside() -> tuple[np.ndarray, np.ndarray]:
-    """The figure without the triangles that lie wholly within one of its capsules."""
+    """All vertices of the figure, and the triangles that do not lie within one of its capsules."""
     vertices, triangles = figure(), figure_triangles()
     hidden = [inside(vertices, segment)[triangles].all(1) for segment in SEGMENTS]
     return vertices, triangles[~np.any(hidden, axis=0)]
@@ -71,7 +72,7 @@ def main() -> None:
     ideal = mesh.vertices @ TO_NATIVE.T
     wrap = wrapped(ideal, neighbour_mean(mesh.triangles))
     wrap[mesh.face_interior] = ideal[mesh.face_interior]  # declared in fill_segments, so never looked at
-    write("native.obj", figure(), figure_triangles())
+    write("native.obj", *outside())
     write("wrap.obj", wrap, mesh.triangles)
 
 
