@@ -6,6 +6,7 @@ import argparse
 import importlib
 import os
 import sys
+import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,7 +19,17 @@ from soma_core.tasks import EXIT_BACKEND, EXIT_FAILED, EXIT_OK, EXIT_USAGE
 if TYPE_CHECKING:
     from soma_core.config.compose import Task
 
-__all__ = ["EXIT_BACKEND", "EXIT_FAILED", "EXIT_OK", "EXIT_USAGE", "TASKS", "TaskRow", "console", "main"]
+__all__ = [
+    "EXIT_BACKEND",
+    "EXIT_FAILED",
+    "EXIT_OK",
+    "EXIT_PIPE",
+    "EXIT_USAGE",
+    "TASKS",
+    "TaskRow",
+    "console",
+    "main",
+]
 
 EXIT_INTERRUPTED = 130
 EXIT_PIPE = 141
@@ -40,6 +51,9 @@ class TaskRow:
 TASKS = {
     "animate": TaskRow(
         module="animate", summary="pose a body by a motion; write NPZ, USD, GLB and a picture"
+    ),
+    "invert": TaskRow(
+        module="invert", summary="find the pose of every frame of a moving mesh, errors in millimetres"
     ),
     "train-shape": TaskRow(
         module="train_shape", summary="learn the native shape space from installed backends"
@@ -178,8 +192,23 @@ def main(arguments: Sequence[str]) -> int:
         return EXIT_INTERRUPTED
 
 
+def _warning_text(
+    message: Warning | str, category: type[Warning], filename: str, lineno: int, line: str | None = None
+) -> str:
+    """A backend's warning as one line; everybody else's as Python writes it."""
+    from soma_core.plugin.errors import BackendWarning
+
+    if issubclass(category, BackendWarning):
+        return f"soma: {message}\n"
+    return _PYTHON_WARNING_TEXT(message, category, filename, lineno, line)
+
+
+_PYTHON_WARNING_TEXT = warnings.formatwarning
+
+
 def console() -> None:
     """Entry point of the console script."""
+    warnings.formatwarning = _warning_text
     try:
         code: int | str | None = main(sys.argv[1:])
     except SystemExit as stop:  # hydra and argparse end the process once they have printed their help

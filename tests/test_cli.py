@@ -4,16 +4,22 @@ from __future__ import annotations
 
 import importlib.util
 import json
+import os
 import subprocess
 import sys
+import warnings
 from pathlib import Path
 
 import pytest
 
 from soma_core import __version__, cli
-from soma_core.cli import EXIT_BACKEND, EXIT_FAILED, EXIT_OK, EXIT_USAGE, TASKS, main
+from soma_core.cli import EXIT_BACKEND, EXIT_FAILED, EXIT_OK, EXIT_PIPE, EXIT_USAGE, TASKS, main
 from soma_core.errors import AssetError, SomaError
 from soma_core.paths import assets_dir, configs_dir
+from soma_core.plugin.errors import BackendWarning
+from tests.plugin.installed import Distribution
+
+ROOT = Path(__file__).resolve().parents[1]
 
 
 def _write(config, output: Path) -> None:
@@ -132,6 +138,44 @@ def test_a_backend_is_shown(capsys) -> None:
     assert json.loads(capsys.readouterr().out)["name"] == "soma"
 
 
+@pytest.mark.parametrize("arguments", [["animate", "--help"], ["--help"], ["backends"]])
+def test_a_reader_that_goes_away_ends_the_command_quietly(arguments: list[str]) -> None:
+    """As in ``soma animate --help | head -1``."""
+    code = "from soma_core.cli import console; console()"
+    with subprocess.Popen(
+        [sys.executable, "-c", code, *arguments], stdout=subprocess.PIPE, stderr=subprocess.PIPE
+    ) as process:
+        assert process.stdout is not None
+        assert process.stderr is not None
+        process.stdout.close()
+        assert process.stderr.read() == b""
+    assert process.returncode == EXIT_PIPE
+
+
+def test_a_warning_about_a_backend_is_one_line(monkeypatch) -> None:
+    monkeypatch.setattr(warnings, "formatwarning", warnings.formatwarning)
+    monkeypatch.setattr(cli, "main", lambda arguments: EXIT_OK)
+    with pytest.raises(SystemExit, match="^0$"):
+        cli.console()
+    where = ("plugin.py", 3, "code()")
+    assert warnings.formatwarning("is old", BackendWarning, *where) == "soma: is old\n"
+    assert warnings.formatwarning("is odd", UserWarning, *where).startswith(
+        "plugin.py:3: UserWarning: is odd"
+    )
+
+
+@pytest.mark.parametrize("stop", [0, 3, None])
+def test_the_console_script_ends_with_the_code_of_the_command(stop, monkeypatch) -> None:
+    def end(arguments):
+        raise SystemExit(stop)
+
+    monkeypatch.setattr(warnings, "formatwarning", warnings.formatwarning)
+    monkeypatch.setattr(cli, "main", end)
+    with pytest.raises(SystemExit) as caught:
+        cli.console()
+    assert caught.value.code == stop
+
+
 def test_assets_path_and_verify(capsys, tmp_path: Path) -> None:
     assert main(["assets", "path"]) == EXIT_OK
     assert capsys.readouterr().out == f"{assets_dir()}\n"
@@ -140,10 +184,13 @@ def test_assets_path_and_verify(capsys, tmp_path: Path) -> None:
     assert str(tmp_path) in capsys.readouterr().err
 
 
-def _modules_after(code: str) -> set[str]:
-    """Top-level modules that a fresh interpreter holds after running `code`."""
+def _modules_after(code: str, *, path: Path | None = None) -> set[str]:
+    """Top-level modules that a fresh interpreter holds after running `code`; `path` is put before its own."""
     script = f"{code}\nimport sys; sys.stderr.write(' '.join(sorted(sys.modules)))"
-    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(map(str, filter(None, (path, ROOT))))}
+    done = subprocess.run(
+        [sys.executable, "-c", script], capture_output=True, text=True, check=True, env=environment
+    )
     return {name.partition(".")[0] for name in done.stderr.split()}
 
 
@@ -161,3 +208,23 @@ def test_help_and_listing_import_no_plugin_and_nothing_heavy(arguments: list[str
         "soma_backend_anny",
         "anny",
     }
+
+
+@pytest.mark.parametrize(
+    "arguments", [["--help"], ["backends"], ["backends", "--json"], ["backends", "--help"]]
+)
+def test_help_and_listing_import_none_of_fifty_plugins(arguments: list[str], tmp_path: Path) -> None:
+    names = [f"p{number:02d}" for number in range(50)]
+    for name in names:
+        Distribution(name=name).install(tmp_path)
+    code = f"""
+import contextlib, io
+from soma_core.cli import main
+text = io.StringIO()
+with contextlib.redirect_stdout(text), contextlib.suppress(SystemExit):
+    main({arguments!r})
+assert "--help" in {arguments!r} or all(name in text.getvalue() for name in {names!r})
+"""
+    loaded = _modules_after(code, path=tmp_path)
+    assert "soma_core" in loaded
+    assert not {name for name in loaded if name.startswith("soma_backend_")}

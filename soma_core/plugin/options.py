@@ -117,7 +117,8 @@ class _Value:
             return self.mapping(value, hint)
         if origin in (list, tuple, typing.get_origin(Sequence[int])):
             return self.sequence(value, hint)
-        return self.plain(value, hint) if isinstance(hint, type) else value
+        known = isinstance(hint, type) and hint is not Any  # Any is a class from Python 3.11 on
+        return self.plain(value, hint) if known else value
 
     def one_of(self, value: Any, hint: Any) -> Any:
         for member in sorted(get_args(hint), key=lambda each: type(value) is not each):  # the very type first

@@ -270,7 +270,7 @@ class Registry:
         record.manager, record.spec, record.state = manager, spec, "declared"
         if spec.api < API_VERSION:
             fix = f"Run: {reinstall_command(record.offers[0].distribution)}"
-            warnings.warn(f"{record.who}: spec: {_spoken(spec)}. {fix}", BackendWarning, stacklevel=4)
+            warnings.warn(f"{record.who}: spec: {_spoken(spec)}. {fix}", BackendWarning, stacklevel=3)
 
     def _check_files(self, record: _Record, spec: BackendSpec) -> None:
         for needed in spec.files:

@@ -9,7 +9,7 @@ import sys
 from collections.abc import Callable, Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from soma_core.plugin import listing
 from soma_core.plugin.errors import BackendError
@@ -17,6 +17,9 @@ from soma_core.plugin.registry import Registry, default_registry
 from soma_core.plugin.requirements import read_environment
 from soma_core.progress import progress
 from soma_core.tasks import EXIT_BACKEND, EXIT_FAILED, EXIT_OK
+
+if TYPE_CHECKING:
+    from soma_core.rig import CanonicalMesh, Rig
 
 __all__ = ["load_all", "run_verb", "show"]
 
@@ -78,17 +81,18 @@ def _list(options: argparse.Namespace) -> tuple[str, int]:
     return text, EXIT_BACKEND if broken else EXIT_OK
 
 
-def load_all(registry: Registry) -> None:
+def load_all(registry: Registry, *, canonical: tuple[CanonicalMesh, Rig] | None = None) -> None:
     """Bring every usable backend as far as it goes: imported, declared, built, and one body made.
 
-    What fails is recorded in the registry; with SOMA_STRICT=1 the first failure is raised.
+    What fails is recorded in the registry; with SOMA_STRICT=1 the first failure is raised. `canonical` is
+    another mesh and rig than the shipped ones.
     """
     from soma_core.layer import SomaLayer
 
     names = registry.names()
     for name in progress(names, label="loading backends", total=len(names), after=5.0):
         with contextlib.suppress(BackendError):
-            SomaLayer(name, kernels="torch", registry=registry).identity()
+            SomaLayer(name, kernels="torch", canonical=canonical, registry=registry).identity()
 
 
 def _show(options: argparse.Namespace) -> tuple[str, int]:

@@ -13,6 +13,7 @@ from soma_core.config import compose, searchpath
 from soma_core.plugin.errors import BackendConflictError, BrokenBackendError
 from soma_core.plugin.registry import Registry
 from tests.plugin.fakes import FakeEntryPoint, declares
+from tests.plugin.installed import Distribution
 
 
 @pytest.fixture
@@ -65,6 +66,43 @@ def test_a_plugin_without_a_config_is_told_what_to_add(registry: Registry, tmp_p
         match=r'"bare" \(soma-backend-bare 1.0\): config: .*ships no configs/backend/bare.yaml',
     ):
         _compose(tmp_path, "backend=bare")
+
+
+def test_two_plugins_with_one_file_are_our_conflict_and_nobody_elses(
+    site: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """hydra would take the file of whoever comes first, without a word."""
+    Distribution(name="acme").install(site)
+    Distribution(name="bodies", configs={"backend/acme.yaml": "", "backend/bodies.yaml": ""}).install(site)
+    Distribution(name="innocent").install(site)
+    found = Registry()
+    monkeypatch.setattr(searchpath, "default_registry", lambda: found)
+    monkeypatch.setattr(compose, "default_registry", lambda: found)
+    for choice in ("acme", "bodies"):
+        with pytest.raises(BackendConflictError) as caught:
+            _compose(tmp_path, f"backend={choice}")
+        assert (
+            caught.value.who
+            == 'config "backend/acme.yaml" (soma-backend-acme 1.0 and soma-backend-bodies 1.0)'
+        )
+        assert caught.value.stage == "config"
+    (config,) = _compose(tmp_path, "backend=innocent", "backend.params.size=0.25")
+    assert config.backend.params.size == 0.25
+
+
+def test_a_plugin_cannot_take_the_place_of_a_config_of_the_core(
+    site: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    Distribution(
+        name="acme", configs={"backend/soma.yaml": "name: acme", "experiment/mine.yaml": ""}
+    ).install(site)
+    found = Registry()
+    monkeypatch.setattr(searchpath, "default_registry", lambda: found)
+    monkeypatch.setattr(compose, "default_registry", lambda: found)
+    (config,) = _compose(tmp_path, "backend=soma")
+    assert config.backend.name == "soma"
+    with pytest.raises(BackendConflictError, match='"backend/soma.yaml" .soma-body-core .*acme'):
+        _compose(tmp_path, "+experiment=mine")
 
 
 def test_a_conflict_is_reported_as_one(registry: Registry, tmp_path: Path) -> None:

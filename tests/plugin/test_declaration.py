@@ -2,14 +2,26 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-from typing import Any
+import math
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import pytest
 
 from soma_core.plugin.declaration import did_you_mean, spec_problem
-from soma_core.plugin.spec import Parameter
+from soma_core.plugin.spec import FileNeeded, Parameter, WrapPair
 from tests.plugin.fakes import SOUND
+
+if TYPE_CHECKING:
+    from nowhere import Missing
+
+
+@dataclass
+class Unreadable:
+    """Options whose annotation was imported for typing only."""
+
+    value: Missing | None = None
 
 
 def test_a_sound_declaration_has_no_problem() -> None:
@@ -29,6 +41,25 @@ def test_a_sound_declaration_has_no_problem() -> None:
         ({"params": (Parameter(name="a"), Parameter(name="a"))}, "declares a more than once"),
         ({"params": (Parameter(name="a b"),)}, "'a b' is no key"),
         ({"params": (Parameter(name="a", range=(1.0, 1.0)),)}, "range of parameter a is (1.0, 1.0)"),
+        ({"params": (Parameter(name=3),)}, "the parameter name 3 is no key"),
+        (
+            {"params": (Parameter(name="a", range=(0, math.nan)),)},
+            "the range of parameter a is (0, nan)",
+        ),
+        ({"params": (Parameter(name="a", range=3),)}, "the range of parameter a is 3, expected two finite"),
+        ({"params": (Parameter(name="a", shape=10),)}, "the shape of parameter a is 10, expected a tuple"),
+        ({"params": (Parameter(name="a", shape=(-1,)),)}, "the shape of parameter a is (-1,)"),
+        ({"params": (Parameter(name="a", default=None),)}, "the default of parameter a is None"),
+        ({"params": (Parameter(name="a", default=True),)}, "the default of parameter a is True"),
+        ({"api": "1"}, "api is '1', expected the whole number of a contract version"),
+        ({"licence": None}, "licence is None, expected a text"),
+        ({"fill_segments": "mouth_bag"}, "fill_segments is 'mouth_bag', expected a tuple of names"),
+        (
+            {"wrap": WrapPair(native="a", wrap=Path())},
+            "wrap.native names 'a', expected a pathlib.Path",
+        ),
+        ({"files": (FileNeeded(path="m", description=""),)}, "files names 'm', expected a pathlib.Path"),
+        ({"options": Unreadable}, "the annotations of Unreadable cannot be read (name 'Missing' is not"),
         ({"wrap": ("a.obj", "b.obj")}, "wrap is ('a.obj', 'b.obj')"),
         ({"files": ("model.pkl",)}, "files is ('model.pkl',)"),
         ({"options": dict}, "options is <class 'dict'>, expected a dataclass type"),

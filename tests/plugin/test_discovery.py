@@ -2,87 +2,106 @@
 
 from __future__ import annotations
 
-import importlib
+import logging
+import site as interpreter_site
 import sys
 from pathlib import Path
 
 import pytest
 
-from soma_core.plugin.discovery import Offer, config_folder, find_offers
+from soma_core.plugin.discovery import Offer, config_folder, find_offers, normalised
 from soma_core.plugin.registry import Registry
+from tests.plugin.fakes import FakeEntryPoint
+from tests.plugin.installed import Distribution
 
 
-def install(
-    site: Path, name: str, *, package_root: Path | None = None, version: str = "1.0", body: str = ""
-) -> None:
-    """Write a distribution into `site`; its package lies there too (a wheel) or elsewhere (editable)."""
-    package = f"soma_backend_{name}"
-    root = package_root or site
-    configs = root / package / "configs" / "backend"
-    configs.mkdir(parents=True, exist_ok=True)
-    (root / package / "__init__.py").write_text(body or "raise RuntimeError('imported')\n")
-    (configs / f"{name}.yaml").write_text(f"name: {name}\nparams: {{size: null}}\noptions: {{}}\n")
-    info = site / f"{package}-{version}.dist-info"
-    info.mkdir()
-    (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: soma-backend-{name}\nVersion: {version}\n")
-    (info / "entry_points.txt").write_text(f"[soma_core.backends]\n{name} = {package}\n")
-    if package_root is not None:
-        (site / f"_{package}.pth").write_text(f"{package_root}\n")
+def _offer(target: str) -> Offer:
+    return Offer(name="x", distribution="x", version="1", target=target, load=lambda: None)
 
 
-@pytest.fixture
-def site(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    folder = tmp_path / "site-packages"
-    folder.mkdir()
-    monkeypatch.syspath_prepend(str(folder))
-    importlib.invalidate_caches()
-    return folder
+def _names() -> tuple[str, ...]:
+    return Registry().names()
 
 
 def test_a_wheel_is_found_without_importing_it(site: Path) -> None:
-    install(site, "acme")
-    importlib.invalidate_caches()
+    package = Distribution(name="acme").install(site)
     registry = Registry()
     assert "acme" in registry.names()
-    assert ("soma-backend-acme", site / "soma_backend_acme" / "configs") in registry.config_dirs()
+    assert ("soma-backend-acme", package / "configs") in registry.config_dirs()
     assert "soma_backend_acme" not in sys.modules
 
 
+@pytest.mark.parametrize("src", [False, True], ids=["flat", "src"])
+@pytest.mark.parametrize("finder", [False, True], ids=["path entry", "import hook"])
 def test_an_editable_install_is_found_without_importing_it(
-    site: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    site: Path, tmp_path: Path, src: bool, finder: bool
 ) -> None:
-    source = tmp_path / "checkout" / "src"
-    install(site, "acme", package_root=source)
-    monkeypatch.syspath_prepend(str(source))  # what the interpreter does with the .pth file at start
-    assert ("soma-backend-acme", source / "soma_backend_acme" / "configs") in Registry().config_dirs()
+    """hatchling leaves a path entry, setuptools a path entry for src layouts and a hook for flat ones."""
+    package = Distribution(name="acme").install_editable(site, tmp_path / "checkout", src=src, finder=finder)
+    interpreter_site.addsitedir(str(site))  # reads the .pth files, as the interpreter does when it starts
+    registry = Registry()
+    assert "acme" in registry.names()
+    assert ("soma-backend-acme", package / "configs") in registry.config_dirs()
     assert "soma_backend_acme" not in sys.modules
 
 
-def test_an_editable_install_beside_a_stale_wheel_counts_once(
-    site: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    install(site, "acme", version="1.0")
-    newer = tmp_path / "newer"
-    newer.mkdir()
-    install(newer, "acme", version="2.0")
-    monkeypatch.syspath_prepend(str(newer))
+def test_an_editable_install_beside_a_stale_wheel_counts_once(site: Path, tmp_path: Path) -> None:
+    stale = tmp_path / "later-on-the-path"
+    Distribution(name="acme", version="1.0").install(stale)
+    sys.path.append(str(stale))
+    Distribution(name="acme", version="2.0").install_editable(site, tmp_path / "checkout")
     (offer,) = find_offers()["acme"]
     assert offer.version == "2.0"
 
 
-def test_blocked_and_conflicting_backends_add_no_configs(site: Path) -> None:
-    install(site, "acme")
+def test_a_package_is_not_a_backend_by_its_name(site: Path) -> None:
+    Distribution(name="stray").write_package(site)
+    assert "stray" not in _names()
+    assert not any("stray" in str(folder) for _, folder in Registry().config_dirs())
+
+
+def test_of_two_backends_in_one_distribution_only_the_one_asked_for_is_loaded() -> None:
+    points = [FakeEntryPoint(name, distribution="soma-backend-two") for name in ("first", "second")]
+    for point in points:
+        point.value = f"soma_backend_two.{point.name}"
+    offers = find_offers(points)
+    offers["first"][0].load()
+    assert [point.loads for point in points] == [1, 0]
+
+
+@pytest.mark.parametrize(
+    ("file", "text"),
+    [
+        ("entry_points.txt", "[soma_core.backends]\nno value\n"),
+        ("entry_points.txt", "\x00"),
+        ("METADATA", ""),
+    ],
+)
+def test_damaged_metadata_hurts_nobody_else(
+    site: Path, file: str, text: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    Distribution(name="acme").install(site)
+    (Distribution(name="bad").write_metadata(site) / file).write_text(text)
+    with caplog.at_level(logging.WARNING, logger="soma_core"):
+        assert {"acme", "soma"} <= set(_names())
+    if "no value" in text:
+        assert f"the metadata of soma-backend-bad in {site} is damaged" in caplog.text
+
+
+def test_blocked_backends_add_no_configs(site: Path) -> None:
+    Distribution(name="acme").install(site)
     assert Registry(allowed=["soma"]).config_dirs() == ()
 
 
 @pytest.mark.parametrize("package", ["no_such_package_at_all", "sys", "__main__"])
 def test_a_package_without_configs_has_no_folder(package: str) -> None:
-    offer = Offer(name="x", distribution="x", version="1", target=f"{package}:plugin", load=lambda: None)
-    assert config_folder(offer) is None
+    assert config_folder(_offer(f"{package}:plugin")) is None
 
 
 def test_the_top_level_package_is_read_from_the_target() -> None:
-    def package(target: str) -> str:
-        return Offer(name="x", distribution="x", version="1", target=target, load=lambda: None).package
+    targets = ("acme.bodies.first:plugin", "acme:plugin", "acme")
+    assert {_offer(target).package for target in targets} == {"acme"}
 
-    assert package("acme.bodies.first:plugin") == package("acme:plugin") == package("acme") == "acme"
+
+def test_names_that_pip_takes_for_equal_are_equal() -> None:
+    assert normalised("Soma_Backend.Acme") == normalised("soma--backend-acme") == "soma-backend-acme"
