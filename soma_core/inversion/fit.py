@@ -253,7 +253,7 @@ def _without_gaps(vertices: Tensor, weights: Tensor, layer: SomaLayer) -> tuple[
         return vertices, finite
     known = torch.isfinite(vertices).all(-1)
     whole = (known | (weights == 0)).all(1)
-    bind = torch.as_tensor(layer.rig.bind_shape, dtype=vertices.dtype, device=vertices.device)
+    bind = torch.tensor(layer.rig.bind_shape, dtype=vertices.dtype, device=vertices.device)
     return torch.where((known & whole[:, None])[..., None], vertices, bind), whole
 
 
