@@ -17,12 +17,17 @@ __all__ = [
     "Experiment",
     "FrameRange",
     "Gallery",
+    "InversionChoice",
+    "InvertConfig",
     "Kernels",
+    "LengthUnit",
     "Lod",
     "Picture",
     "Product",
+    "Topology",
     "TrainShapeConfig",
     "Translation",
+    "Upward",
     "register_schemas",
 ]
 
@@ -42,6 +47,14 @@ class Kernels(StrEnum):
     warp = "warp"
 
 
+class LengthUnit(StrEnum):
+    """Unit of a file's vertices."""
+
+    m = "m"
+    cm = "cm"
+    mm = "mm"
+
+
 class Lod(StrEnum):
     """Level of detail of the canonical mesh."""
 
@@ -58,12 +71,27 @@ class Product(StrEnum):
     png = "png"
 
 
+class Topology(StrEnum):
+    """Which mesh vertices belong to."""
+
+    auto = "auto"
+    canonical = "canonical"
+    native = "native"
+
+
 class Translation(StrEnum):
     """Where the body stands."""
 
     ground = "ground"
     motion = "motion"
     none = "none"
+
+
+class Upward(StrEnum):
+    """Upward axis of a file's vertices."""
+
+    y = "y"
+    z = "z"
 
 
 @dataclass
@@ -108,6 +136,34 @@ class AnimateConfig:
     seed: int = 0
     write: list[Product] = field(default_factory=lambda: list(Product))
     picture: Picture = field(default_factory=Picture)
+
+
+@dataclass
+class InversionChoice:
+    """How poses are found: stages in order, most iterations of the last, when they end [rad], kernels."""
+
+    stages: list[str] = field(default_factory=lambda: ["procrustes", "gauss_newton"])
+    iterations: int = 10
+    tolerance: float = 1e-5
+    kernels: Kernels = Kernels.auto
+
+
+@dataclass
+class InvertConfig:
+    """Configuration of ``soma invert``."""
+
+    backend: BackendChoice = field(default_factory=BackendChoice)
+    inversion: InversionChoice = field(default_factory=InversionChoice)
+    input: str | None = None
+    fps: float | None = None
+    unit: LengthUnit | None = None
+    up: Upward | None = None
+    topology: Topology = Topology.auto
+    lod: Lod = Lod.mid
+    device: str = "cpu"
+    seed: int = 0
+    chunk: int = 256
+    picture: Picture = field(default_factory=lambda: Picture(frames=5))
 
 
 @dataclass
@@ -165,6 +221,7 @@ def register_schemas() -> None:
     store = ConfigStore.instance()
     for task, schema in (
         ("animate", AnimateConfig),
+        ("invert", InvertConfig),
         ("train_shape", TrainShapeConfig),
         ("evaluate", EvaluateConfig),
         ("bench", BenchConfig),

@@ -31,8 +31,8 @@ _ROUND = (1, 2, 5, 10)
 _SHOWN_SHARE = 0.99
 """Share of the vertices below the top of the scale: a few outliers would leave the rest without colour."""
 
-_LEAST_TOP = 1e-3
-"""Smallest top of the scale [mm]: below it there is only rounding."""
+_LEAST_TOP = 0.1
+"""Smallest top of the scale [mm]: what nobody would see looks like no error."""
 
 _INK = (70, 70, 72)
 

@@ -39,6 +39,7 @@ def result(canonical):
         translation=torch.zeros(FRAMES, 3),
         vertex_error=error,
         valid=valid,
+        determined=valid[:, None].expand(-1, len(rig.user_joint_names)),
         converged=torch.arange(FRAMES) % 2 == 0,
         iterations=torch.arange(FRAMES),
         residual=torch.zeros(FRAMES),

@@ -24,7 +24,7 @@ def test_vertices_without_a_target_have_a_colour_of_their_own():
 
 @pytest.mark.parametrize(
     ("errors", "top"),
-    [([0.0], 0.001), ([3.1] * 100, 5.0), ([0.02] * 100, 0.02), ([80.0], 100.0), ([np.nan], 0.001)],
+    [([0.0], 0.1), ([3.1] * 100, 5.0), ([0.2] * 100, 0.2), ([80.0], 100.0), ([np.nan], 0.1)],
 )
 def test_the_top_of_the_scale_is_a_round_number(errors, top):
     assert scale_top(np.array(errors)) == pytest.approx(top)

@@ -1,0 +1,261 @@
+"""From a mesh sequence to a motion: the round trip, chunks, interruptions, and what is refused."""
+
+import json
+
+import numpy as np
+import pytest
+import torch
+from omegaconf import OmegaConf
+
+from soma_core.cli import EXIT_OK, main
+from soma_core.config.schema import InvertConfig
+from soma_core.errors import InputError
+from soma_core.io import open_vertex_sequence, read_motion
+from soma_core.layer import SomaLayer
+from soma_core.tasks import animate, invert
+from soma_core.tasks.fit_results import worst_frames
+from soma_core.tasks.fitted_chunks import FittedChunks
+
+ROUND_TRIP_MM = 0.1
+"""Largest distance between the input and what soma animate makes of the fitted motion."""
+
+CHUNK_TOLERANCE = 1e-5
+"""Metres: frames are fitted in groups, and a group decides together when it is done."""
+
+FRAMES = 8
+
+
+def configured(**changes):
+    settings = {
+        "backend": {"name": "soma", "params": {"shape": [1.0, -0.5]}}, "lod": "low",
+        "picture": {"frames": 0}, "fps": 24.0, "unit": "m", "topology": "canonical",
+    }  # fmt: skip
+    return OmegaConf.merge(OmegaConf.structured(InvertConfig), settings | changes)
+
+
+@pytest.fixture(scope="module")
+def layer():
+    return SomaLayer("soma", lod="low")
+
+
+@pytest.fixture(scope="module")
+def vertices(layer):
+    """Eight frames of the shipped clip, spread over it, on a body that is not the default."""
+    clip = OmegaConf.create(
+        {"motion": None, "motion_fps": None, "frames": {"start": 0, "stop": 440, "step": 55}}
+    )
+    motion = animate.load_motion(clip)
+    identity = layer.identity({"shape": [1.0, -0.5]})
+    with torch.no_grad():
+        posed = layer.pose(identity, torch.as_tensor(motion.rotations), torch.as_tensor(motion.translation))
+    return posed.vertices.numpy()
+
+
+@pytest.fixture
+def source(vertices, tmp_path):
+    np.savez(tmp_path / "body.npz", vertices=vertices)
+    return tmp_path / "body.npz"
+
+
+def reposed(layer, folder):
+    """Vertices of the fitted motion."""
+    motion = read_motion(folder / "motion.npz")
+    identity = layer.identity(motion.identity["params"])
+    rotations, hips = torch.as_tensor(motion.rotations), torch.as_tensor(motion.translation)
+    with torch.no_grad():
+        return layer.pose(identity, rotations, hips).vertices.numpy()
+
+
+def test_invert_then_animate_reproduces_the_input(layer, vertices, source, tmp_path):
+    invert.run(configured(input=str(source)), tmp_path / "fit")
+    assert sorted(path.name for path in (tmp_path / "fit").iterdir()) == [
+        "frames.npz",
+        "motion.npz",
+        "report.json",
+    ]
+    motion = read_motion(tmp_path / "fit/motion.npz")
+    assert (motion.fps, motion.rig_revision, motion.convention) == (
+        24.0,
+        layer.rig.revision,
+        "t_pose_relative",
+    )
+    assert motion.identity == {"backend": "soma", "params": {"shape": [1.0, -0.5]}}
+    identity = layer.identity(motion.identity["params"])
+    with torch.no_grad():
+        found = animate.animate(layer, identity, motion, translation="motion", keep=list(range(FRAMES)))
+    for frame, expected in enumerate(vertices):
+        assert 1e3 * np.abs(found.vertices[frame] - expected).max() < ROUND_TRIP_MM
+
+
+def test_the_report_says_what_was_fitted_and_how_well(source, tmp_path):
+    invert.run(configured(input=str(source)), tmp_path / "fit")
+    report = json.loads((tmp_path / "fit/report.json").read_text(encoding="utf-8"))
+    assert report["settings"]["input"] == str(source)
+    assert report["settings"]["params"] == {"shape": [1.0, -0.5]}
+    assert report["frames"] == FRAMES
+    assert report["converged_share"] == 1
+    assert report["error_mm"]["all"]["max"] < ROUND_TRIP_MM
+    with np.load(tmp_path / "fit/frames.npz") as frames:
+        assert frames["valid"].all()
+        assert 1e3 * frames["largest_error"].max() == pytest.approx(
+            max(row["max"] for row in report["error_mm"].values()), rel=1e-5
+        )
+
+
+def test_our_own_files_go_round(layer, tmp_path):
+    from tests.tasks.test_animate import configured as animation
+
+    animate.run(animation(write=["npz", "usd", "glb"]), tmp_path / "made")
+    expected = read_motion(tmp_path / "made/motion.npz")
+    for name in ("body.usdc", "body.glb"):
+        path = tmp_path / "made" / name
+        config = configured(input=str(path), fps=None, unit=None, topology="auto", backend={"name": "soma"})
+        invert.run(config, tmp_path / name)
+        found = read_motion(tmp_path / name / "motion.npz")
+        assert found.fps == expected.fps
+        with open_vertex_sequence(path) as sequence:
+            target = sequence.read(0, sequence.frame_count)
+        assert 1e3 * np.abs(reposed(layer, tmp_path / name) - target).max() < ROUND_TRIP_MM
+
+
+def test_chunks_give_what_the_whole_gives(layer, source, tmp_path):
+    invert.run(configured(input=str(source)), tmp_path / "whole")
+    invert.run(configured(input=str(source), chunk=3), tmp_path / "parts")
+    whole, parts = reposed(layer, tmp_path / "whole"), reposed(layer, tmp_path / "parts")
+    assert np.abs(whole - parts).max() < CHUNK_TOLERANCE
+    assert not (tmp_path / "parts/chunks").exists()
+
+
+class Stopping(invert.PoseInversion):
+    """Stops the run at the third chunk, and counts."""
+
+    calls = 0
+
+    def forward(self, *args, **options):
+        type(self).calls += 1
+        if self.calls == 3:
+            raise KeyboardInterrupt
+        return super().forward(*args, **options)
+
+
+def test_a_stopped_run_goes_on_after_the_chunks_that_it_finished(source, tmp_path, monkeypatch, caplog):
+    caplog.set_level("INFO")
+    config = configured(input=str(source), chunk=2)
+    invert.run(config, tmp_path / "whole")
+    monkeypatch.setattr(invert, "PoseInversion", Stopping)
+    monkeypatch.setattr(Stopping, "calls", 0)
+    with pytest.raises(KeyboardInterrupt):
+        invert.run(config, tmp_path / "fit")
+    assert f"hydra.run.dir={tmp_path / 'fit'} goes on from here" in caplog.text
+    assert len(list((tmp_path / "fit/chunks").glob("*.npz"))) == 2
+    assert not (tmp_path / "fit/motion.npz").exists()
+    invert.run(config, tmp_path / "fit")
+    assert "going on after 2 of 4 chunks" in caplog.text
+    assert Stopping.calls == 3 + 2
+    for name in ("motion.npz", "frames.npz"):
+        with np.load(tmp_path / "fit" / name) as found, np.load(tmp_path / "whole" / name) as expected:
+            for key in expected.files:
+                np.testing.assert_array_equal(found[key], expected[key], err_msg=key)
+    assert (tmp_path / "fit/report.json").read_text() == (tmp_path / "whole/report.json").read_text()
+
+
+def test_chunks_of_another_configuration_are_refused(source, tmp_path, monkeypatch):
+    monkeypatch.setattr(invert, "PoseInversion", Stopping)
+    monkeypatch.setattr(Stopping, "calls", 1)
+    with pytest.raises(KeyboardInterrupt):
+        invert.run(configured(input=str(source), chunk=2), tmp_path / "fit")
+    for changes, said in (
+        ({"chunk": 3}, r"chunk: got 3, expected 2, as in the run that .*chunks belongs to"),
+        ({"backend": {"name": "soma"}}, r"params: got {}, expected {'shape': \[1\.0, -0\.5\]}"),
+        ({"fps": 30, "chunk": 5}, r"fps \(and chunk\): got 30"),
+    ):
+        with pytest.raises(InputError, match=said):
+            invert.run(configured(input=str(source), **{"chunk": 2} | changes), tmp_path / "fit")
+    np.savez(source, vertices=np.zeros((FRAMES, 4505, 3)) + 1)
+    with pytest.raises(InputError, match=r"content.*: got .*delete .*chunks to start over"):
+        invert.run(configured(input=str(source), chunk=2), tmp_path / "fit")
+
+
+def test_half_a_chunk_is_done_again(tmp_path):
+    chunks = FittedChunks(tmp_path / "chunks", {"a": 1}, frame_count=5, size=2)
+    assert chunks.ranges == [(0, 2), (2, 4), (4, 5)]
+    for number in range(3):
+        chunks.save(number, {"x": np.full(2, number)})
+    cut = tmp_path / "chunks/000001.npz"
+    cut.write_bytes(cut.read_bytes()[:50])
+    again = FittedChunks(tmp_path / "chunks", {"a": 1}, frame_count=5, size=2)
+    assert again.missing() == [1]
+    again.remove()
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_damaged_frame_is_flagged_and_the_others_are_unharmed(layer, vertices, source, tmp_path, caplog):
+    spoilt = vertices.copy()
+    spoilt[2, 100] = np.nan
+    np.savez(tmp_path / "spoilt.npz", vertices=spoilt)
+    invert.run(configured(input=str(tmp_path / "spoilt.npz")), tmp_path / "fit")
+    assert "1 frames could not be used and hold the T-pose, the first is 2" in caplog.text
+    report = json.loads((tmp_path / "fit/report.json").read_text(encoding="utf-8"))
+    assert (report["unusable_frames"], report["unusable"]) == (1, [2])
+    found = np.delete(reposed(layer, tmp_path / "fit"), 2, axis=0)
+    assert 1e3 * np.abs(found - np.delete(vertices, 2, axis=0)).max() < ROUND_TRIP_MM
+
+
+def test_native_vertices_of_a_plugin(tmp_path):
+    pytest.importorskip("soma_backend_toy")
+    from soma_core.plugin.registry import default_registry
+
+    layer = SomaLayer("toy", lod="low")
+    identity = layer.identity({"legs": 1.1})
+    generator = default_registry().generator("toy", device=layer.device, dtype=layer.dtype)
+    frames = generator.rest(identity.params).numpy() + np.array([[[50.0, 20, 10]], [[0, 0, 0]]])  # [cm]
+    np.save(tmp_path / "toy.npy", frames.astype(np.float32))
+    config = configured(
+        input=str(tmp_path / "toy.npy"),
+        backend={"name": "toy", "params": {"legs": 1.1}},
+        topology="auto",
+        unit=None,
+    )
+    invert.run(config, tmp_path / "fit")
+    moved = read_motion(tmp_path / "fit/motion.npz").translation
+    np.testing.assert_allclose(moved[0] - moved[1], [0.5, 0.1, -0.2], atol=CHUNK_TOLERANCE)
+
+
+def test_the_picture_shows_the_worst_frames(source, tmp_path):
+    pytest.importorskip("pyvista", reason="pictures need pyvista")
+    invert.run(configured(input=str(source), picture={"frames": 2, "width": 300}, chunk=5), tmp_path / "fit")
+    assert (tmp_path / "fit/errors.png").stat().st_size > 1000
+
+
+def test_worst_frames_keep_apart():
+    errors = np.array([0.0, 5, 6, 5, 0, 1, np.nan])
+    np.testing.assert_array_equal(worst_frames(errors, 2, apart=1), [2, 5])
+    np.testing.assert_array_equal(worst_frames(errors, 2, apart=0), [1, 2])
+    assert len(worst_frames(errors, 99, apart=0)) == 6
+    assert len(worst_frames(np.array([np.nan]), 3, apart=0)) == 0
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"input": None}, r"input: got none, expected an \.npz or \.npy"),
+        ({"chunk": 0}, "chunk: got 0, expected at least 1"),
+        ({"fps": None}, r"fps: got none in body\.npz, expected frames per second\. Pass fps=30"),
+        ({"inversion": {"stages": ["guess"]}}, "stages: got 'guess'"),
+    ],
+)
+def test_what_cannot_be_run_says_why(source, tmp_path, changes, said):
+    with pytest.raises(InputError, match=said):
+        invert.run(configured(**{"input": str(source)} | changes), tmp_path / "fit")
+    assert not (tmp_path / "fit/motion.npz").exists()
+
+
+def test_from_the_command_line(source, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    command = ["invert", f"input={source}", "fps=24", "unit=m", "topology=canonical", "lod=low",
+               "backend.params.shape=[1.0,-0.5]", "picture.frames=0", "hydra.run.dir=out"]  # fmt: skip
+    assert main(command) == EXIT_OK
+    streams = capsys.readouterr()
+    assert streams.out.splitlines()[-1] == "out"
+    assert "body.npz: 8 frames of 4505 vertices (canonical) at 24 fps" in streams.err
+    assert "8 frames, 0 of them unusable; converged 100.0%" in streams.err
