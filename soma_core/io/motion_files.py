@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import zipfile
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Literal
 
@@ -121,10 +121,14 @@ def write_motion_parts(
                 if name in _LONG:
                     _write_long(archive, name, _pieces(parts, name), like=array, count=frame_count)
                 else:
-                    with archive.open(f"{name}.npy", "w") as stream:
-                        np.save(stream, array, allow_pickle=False)
+                    _write_short(archive, name, array)
 
     atomic_write(Path(path), write)
+
+
+def _write_short(archive: zipfile.ZipFile, name: str, array: np.ndarray) -> None:
+    with archive.open(f"{name}.npy", "w") as stream:
+        np.save(stream, array, allow_pickle=False)
 
 
 def _pieces(parts: Callable[[], Iterator[Motion]], name: str) -> Iterator[np.ndarray]:
@@ -136,7 +140,7 @@ def _pieces(parts: Callable[[], Iterator[Motion]], name: str) -> Iterator[np.nda
 
 
 def _write_long(
-    archive: zipfile.ZipFile, name: str, pieces: Iterator[np.ndarray], *, like: np.ndarray, count: int
+    archive: zipfile.ZipFile, name: str, pieces: Iterable[np.ndarray], *, like: np.ndarray, count: int
 ) -> None:
     """Write an array of `count` entries piece by piece; `like` tells its type and the shape of an entry."""
     header = {"descr": like.dtype.str, "fortran_order": False, "shape": (count, *like.shape[1:])}
