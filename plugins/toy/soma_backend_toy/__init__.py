@@ -34,7 +34,7 @@ def soma_backend() -> BackendSpec:
         forward="-y",
         params=(
             _factor("size", 0.6, 1.2, "factor of the whole body"),
-            _factor("girth", 0.7, 1.5, "factor of the thickness of trunk and limbs"),
+            _factor("girth", 0.75, 1.3, "factor of the thickness of trunk and limbs"),
             _factor("legs", 0.8, 1.2, "factor of the length of the legs"),
             _factor("arms", 0.8, 1.2, "factor of the length of the arms"),
             _factor("shoulders", 0.85, 1.2, "factor of the width of the shoulders"),
