@@ -12,8 +12,9 @@ from torch import Tensor
 
 from soma_core.errors import InputError
 from soma_core.inversion._inputs import check_vertices, check_weights, refuse_unit_error
-from soma_core.inversion.gauss_newton import GaussNewton, Pose
+from soma_core.inversion.gauss_newton import GaussNewton
 from soma_core.inversion.moments import RestMoments, SkinMoments
+from soma_core.inversion.problem import Pose, Problem
 from soma_core.inversion.result import InversionResult
 from soma_core.inversion.start import ProcrustesStart, best_translation, cloud_extent
 from soma_core.inversion.structure import moment_structure
@@ -28,7 +29,7 @@ __all__ = ["PoseInversion", "Stage", "Topology"]
 Stage = Literal["procrustes", "gauss_newton"]
 Topology = Literal["canonical", "native"]
 
-_STAGES = ("procrustes", "gauss_newton")
+_STAGES: tuple[Stage, ...] = ("procrustes", "gauss_newton")
 
 _CHUNK = 512
 """Frames fitted at a time: enough to fill the SIMD lanes of every core, little enough for memory."""
@@ -171,17 +172,18 @@ class PoseInversion(torch.nn.Module):
         """Result and scale of a chunk of frames."""
         vertices, finite = _without_gaps(vertices, weights, self.layer)
         target, origin = self.moments.target(vertices, rest)
+        problem = Problem(
+            vertices=vertices, weights=weights, identity=identity, rest=rest, target=target, origin=origin
+        )
         extent, side = cloud_extent(target, rest)
         scale = extent.median(1).values
         upright = (side * rest.own[..., 3, 3]).sum(1) > 0
         usable = finite & upright & (scale > _SCALES[0]) & (scale < _SCALES[1])
-        pose = self._first_pose(target, rest)
-        if "gauss_newton" in self.stages:
-            pose = self.solver(target, rest, pose, iterations=self.iterations, tolerance=self.tolerance)
+        pose = self._climb(problem)
         eye = torch.eye(3, dtype=vertices.dtype, device=vertices.device)
         relative = torch.where(usable[:, None, None, None], pose.relative, eye)[:, 1:]
         translation = torch.where(usable[:, None], pose.translation + origin, torch.zeros_like(origin))
-        error, residual = self._compare(vertices, identity, relative, translation, weights)
+        error, residual = self._compare(problem, relative, translation)
         error = torch.where(usable[:, None], error, torch.nan)
         return InversionResult(
             rotations=relative,
@@ -194,18 +196,28 @@ class PoseInversion(torch.nn.Module):
             residual=residual,
         ), scale
 
-    def _first_pose(self, target: Tensor, rest: RestMoments) -> Pose:
-        relative = self.start(target, rest)
-        zero = torch.zeros_like(relative[:, 0, 0])
-        pose = Pose(
-            relative=relative,
-            translation=zero,
-            accepted=torch.zeros(len(zero), dtype=torch.int64, device=zero.device),
-            last_step=torch.full_like(zero[:, 0], torch.inf),
-        )
-        joints = self.moments.joints
+    def _climb(self, problem: Problem) -> Pose:
+        """Run the stages, each from the result of the one before."""
+        pose = None
+        for stage in self.stages:
+            pose = getattr(self, f"_{stage}")(problem, pose)
+        assert pose is not None
+        return pose
+
+    def _procrustes(self, problem: Problem, _pose: Pose | None) -> Pose:
+        """Weighted Procrustes of every joint's own points."""
+        target, rest = problem.target, problem.rest
+        pose = Pose.begin(self.start(target, rest), torch.zeros_like(problem.origin))
         turns, places = self.solver.walk(pose, rest.offsets)
+        joints = self.moments.joints
         return replace(pose, translation=best_translation(target, rest, turns[:, joints], places[:, joints]))
+
+    def _gauss_newton(self, problem: Problem, pose: Pose | None) -> Pose:
+        """Levenberg-Marquardt on the moments."""
+        pose = pose or self._procrustes(problem, None)
+        return self.solver(
+            problem.target, problem.rest, pose, iterations=self.iterations, tolerance=self.tolerance
+        )
 
     def _determined(self, kept: Tensor) -> Tensor:
         """(F, J - 1) from the weighted joints (F, T): whether the target determines a user joint."""
@@ -213,15 +225,14 @@ class PoseInversion(torch.nn.Module):
         all_joints[:, self.moments.joints] = kept
         return all_joints[:, 1:]
 
-    def _compare(
-        self, vertices: Tensor, identity: Identity, relative: Tensor, translation: Tensor, weights: Tensor
-    ) -> tuple[Tensor, Tensor]:
+    def _compare(self, problem: Problem, relative: Tensor, translation: Tensor) -> tuple[Tensor, Tensor]:
         """Vertex errors (F, v) [m] under the forward model, and their weighted root mean square (F,)."""
+        vertices, weights = problem.vertices, problem.weights
         error = vertices.new_empty(vertices.shape[:2])
         for first in range(0, len(vertices), _POSED_AT_A_TIME):
             chunk = slice(first, first + _POSED_AT_A_TIME)
             posed = self.layer.animation.pose(
-                _part(identity, chunk), relative[chunk], translation[chunk], absolute=False
+                _part(problem.identity, chunk), relative[chunk], translation[chunk], absolute=False
             )
             step = posed.vertices.sub_(vertices[chunk])
             torch.linalg.vector_norm(step, dim=-1, out=error[chunk])

@@ -8,7 +8,7 @@ rule), which keeps float32 accurate at the fingertips.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -18,9 +18,10 @@ from soma_core.animation.kinematics import joint_levels
 from soma_core.geometry.rotations import cayley, skew
 from soma_core.inversion.elimination import elimination_plan
 from soma_core.inversion.moments import RestMoments
+from soma_core.inversion.problem import Pose
 from soma_core.inversion.structure import MomentStructure
 
-__all__ = ["GaussNewton", "Pose"]
+__all__ = ["GaussNewton"]
 
 _START_DAMPING = 1e-3
 _LOWER, _RAISE = 0.2, 8.0
@@ -31,20 +32,6 @@ _RIDGE = 1e-9
 
 _LONGEST_STEP = 1.0
 """A joint turns by at most this angle [rad] in one step."""
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Pose:
-    """A pose under way: (F, J, 3, 3) T-pose-relative rotations and the Hips position (F, 3) [m].
-
-    `accepted` counts the steps taken, (F,); `last_step` is the largest joint turn [rad] that the last step
-    asked for, (F,): its size tells how far the minimum may still be.
-    """
-
-    relative: Tensor
-    translation: Tensor
-    accepted: Tensor
-    last_step: Tensor
 
 
 class GaussNewton(torch.nn.Module):
