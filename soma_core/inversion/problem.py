@@ -1,0 +1,63 @@
+"""What the stages of pose inversion share: the problem of a chunk of frames, and a pose under way."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from soma_core.inversion.moments import RestMoments
+from soma_core.skeleton.identity import Identity
+
+__all__ = ["Pose", "Problem"]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Problem:
+    """A chunk of frames to fit.
+
+    Attributes:
+        vertices: targets on the canonical topology, (F, v, 3) [m], finite.
+        weights: vertex weights, (1 or F, v).
+        identity: batch of 1, shared by all frames, or of F.
+        rest: moments of the identity under the weights.
+        target: ``R`` (F, T, 3, 4) of the targets, about `origin`.
+        origin: (F, 3) [m]; poses under way are relative to it.
+    """
+
+    vertices: Tensor
+    weights: Tensor
+    identity: Identity
+    rest: RestMoments
+    target: Tensor
+    origin: Tensor
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Pose:
+    """A pose under way.
+
+    Attributes:
+        relative: T-pose-relative rotations, the root's included, (F, J, 3, 3).
+        translation: Hips position about the problem's origin, (F, 3) [m].
+        accepted: number of steps taken, (F,).
+        last_step: largest joint turn that the last step asked for, (F,) [rad]: its size tells how far the
+            minimum may still be. Infinite before any step.
+    """
+
+    relative: Tensor
+    translation: Tensor
+    accepted: Tensor
+    last_step: Tensor
+
+    @classmethod
+    def begin(cls, relative: Tensor, translation: Tensor) -> Pose:
+        """A pose before any step."""
+        count, device = len(relative), relative.device
+        return cls(
+            relative=relative,
+            translation=translation,
+            accepted=torch.zeros(count, dtype=torch.int64, device=device),
+            last_step=torch.full((count,), torch.inf, dtype=relative.dtype, device=device),
+        )
