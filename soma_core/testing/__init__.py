@@ -16,7 +16,7 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from soma_core.testing.check import Check, CheckFailedError, Level, check
+    from soma_core.testing.conformance import Check, CheckFailedError, Level, check
     from soma_core.testing.context import Context
     from soma_core.testing.report import Report
     from soma_core.testing.run import check_backend
@@ -34,12 +34,12 @@ __all__ = [
 ]
 
 _HOME = {
-    "Check": "check",
-    "CheckFailedError": "check",
+    "Check": "conformance",
+    "CheckFailedError": "conformance",
     "Context": "context",
-    "Level": "check",
+    "Level": "conformance",
     "Report": "report",
-    "check": "check",
+    "check": "conformance",
     "check_backend": "run",
     "conformance_suite": "suite",
 }

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -20,7 +20,9 @@ from soma_core.rig import load_canonical
 from soma_core.rig.mesh import CanonicalMesh
 from soma_core.rig.skeleton import Rig
 from soma_core.skeleton.identity import Identity
-from soma_core.testing.samples import random_rows
+from soma_core.testing.import_probe import ImportProbe, probe_import
+from soma_core.testing.samples import Change, changed_rows, random_rows
+from soma_core.topology.correspondence import Correspondence, load_correspondence
 from soma_core.topology.frames import METRES, native_to_canonical
 from soma_core.topology.transfer import filled_vertices
 from soma_core.topology.wrap_pair import read_obj
@@ -31,6 +33,9 @@ CPU = torch.device("cpu")
 
 _RANDOM_BODIES = 4
 """Random identities that the checks of bodies look at: enough to meet a fault that every body has."""
+
+_CHUNK = 32
+"""Bodies generated at a time, to bound memory."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -89,6 +94,11 @@ class Context:
         """Who offers the backend."""
         return self.registry.offers(self.name)[0]
 
+    @functools.cached_property
+    def import_probe(self) -> ImportProbe:
+        """What declaring does in a fresh interpreter."""
+        return probe_import(self.offer)
+
     @property
     def spec(self) -> BackendSpec:
         """The declaration."""
@@ -143,6 +153,12 @@ class Context:
         covered[filled_vertices(self.spec, self.mesh)] = False
         return covered
 
+    @functools.cached_property
+    def correspondence(self) -> Correspondence:
+        """Where each canonical vertex lies on the native surface; only for backends with a wrap pair."""
+        assert self.spec.wrap is not None
+        return load_correspondence(self.spec.wrap, self.mesh)
+
     @property
     def native_count(self) -> int:
         """Number of vertices that the generator must return."""
@@ -189,6 +205,14 @@ class Context:
     ) -> dict[str, Tensor]:
         """`count` random identities inside the declared ranges."""
         return random_rows(self.parameters, count, seed=seed, dtype=dtype)
+
+    def generated(self, changes: Sequence[Change]) -> Iterator[tuple[Change, Tensor]]:
+        """Each change with the native body (n, 3) that it gives."""
+        for start in range(0, len(changes), _CHUNK):
+            part = changes[start : start + _CHUNK]
+            with torch.no_grad():
+                bodies = self.generator.rest(changed_rows(self.parameters, part, dtype=torch.float64))
+            yield from zip(part, bodies, strict=True)
 
     @functools.cached_property
     def layer(self) -> SomaLayer:

@@ -18,8 +18,8 @@ from soma_core.plugin.errors import BackendError, BrokenBackendError
 from soma_core.plugin.registry import Registry, default_registry
 from soma_core.rig.mesh import CanonicalMesh
 from soma_core.rig.skeleton import Rig
-from soma_core.testing.check import Check, CheckFailedError, Level
 from soma_core.testing.checks import CORE_CHECKS
+from soma_core.testing.conformance import Check, CheckFailedError, Level
 from soma_core.testing.context import Context
 from soma_core.testing.global_state import kept
 from soma_core.testing.report import Outcome, Report
@@ -152,19 +152,20 @@ class ConformanceRun:
 
 def _told(error: BaseException, check: Check, package: str) -> tuple[str, str, str, str]:
     """Where, got, expected and fix of whatever a check raised."""
+    promise = "that " + check.summary[:1].lower() + check.summary[1:]
     if isinstance(error, CheckFailedError):
         return error.where, error.got, error.expected, error.fix
     if isinstance(error, InputError):
         return error.argument, str(error.got), str(error.expected), error.fix
     if isinstance(error, BackendError):
-        return error.who, f"{error.stage}: {error.cause}", check.summary, error.fix
+        return error.who, f"{error.stage}: {error.cause}", promise, error.fix
     if isinstance(error, AssetError):
-        return error.path, error.cause, check.summary, error.fix
+        return error.path, error.cause, promise, error.fix
     frames = traceback.extract_tb(error.__traceback__)
     own = [frame for frame in frames if package in Path(frame.filename).parts]
     place = (own or frames)[-1]
     got = f"{type(error).__name__}: {error}" if str(error) else type(error).__name__
-    return f"{place.filename}:{place.lineno}", got, check.summary, "Mend what raises it."
+    return f"{place.filename}:{place.lineno}", got, promise, "Mend what raises it."
 
 
 def _as_expected(outcome: Outcome, reason: str) -> Outcome:

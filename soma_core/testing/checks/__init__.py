@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from soma_core.testing.check import Check
 from soma_core.testing.checks import (
+    agreement,
     behaviour,
     body,
     declaration,
@@ -14,6 +14,7 @@ from soma_core.testing.checks import (
     transfer,
     wrap,
 )
+from soma_core.testing.conformance import Check
 
 __all__ = ["CORE_CHECKS"]
 
@@ -24,6 +25,7 @@ CORE_CHECKS: tuple[Check, ...] = (
     *generator.CHECKS,
     *behaviour.CHECKS,
     *parameters.CHECKS,
+    *agreement.CHECKS,
     *body.CHECKS,
     *transfer.CHECKS,
     *skeleton.CHECKS,

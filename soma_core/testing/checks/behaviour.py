@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from soma_core.plugin.spec import Generator
-from soma_core.testing.check import CheckFailedError, check
+from soma_core.testing.conformance import CheckFailedError, check
 from soma_core.testing.context import Context
 from soma_core.testing.global_state import changes, snapshot
 
@@ -39,7 +39,7 @@ def _no_parameters(context: Context) -> str:
     return "" if context.parameters else "the backend has no parameters"
 
 
-@check("deterministic", needs=("generator-device", "finite"))
+@check("deterministic", level="core", needs=("finite",))
 def deterministic(context: Context) -> None:
     """Equal parameters give equal bodies, whatever was generated before."""
     first, other = (context.random_params(2, seed=seed) or context.default_params() for seed in (1, 2))
@@ -52,7 +52,7 @@ def deterministic(context: Context) -> None:
     _compare(context, _rest(context.new_generator(), other), second, "rest() of a new generator", fix)
 
 
-@check("batch-invariant", needs=("deterministic",), unless=_no_parameters)
+@check("batch-invariant", level="core", needs=("deterministic",), unless=_no_parameters)
 def batch_invariant(context: Context) -> None:
     """Each body of a batch is the one it would be alone."""
     params = context.random_params()
@@ -63,7 +63,7 @@ def batch_invariant(context: Context) -> None:
         _compare(context, bodies[row : row + 1], alone, f"random body {row} in a batch of {len(bodies)}", fix)
 
 
-@check("inputs-unchanged", needs=("generator-device",), unless=_no_parameters)
+@check("inputs-unchanged", level="core", needs=("generator-device",), unless=_no_parameters)
 def inputs_unchanged(context: Context) -> None:
     """The generator leaves the tensors that it is given as they are."""
     params = context.random_params()

@@ -7,7 +7,7 @@ import itertools
 import numpy as np
 
 from soma_core.plugin.spec import Axis
-from soma_core.testing.check import CheckFailedError, check
+from soma_core.testing.conformance import CheckFailedError, check
 from soma_core.testing.context import Context
 
 __all__ = ["CHECKS"]
@@ -22,7 +22,15 @@ _STATURE_M = (0.25, 3.0)
 @check(
     "upright",
     level="core",
-    needs=("neutral-equals-obj", "linear-basis", "wrap-distance", "wrap-order", "finite"),
+    needs=(
+        "neutral-equals-obj",
+        "linear-basis",
+        "wrap-faces",
+        "wrap-distance",
+        "batch-invariant",
+        "inputs-unchanged",
+        "group-defaults",
+    ),
 )
 def upright(context: Context) -> None:
     """The default body stands upright, faces forward, and is not mirrored."""

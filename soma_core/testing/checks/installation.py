@@ -12,9 +12,8 @@ from soma_core.config.schema import register_schemas
 from soma_core.paths import configs_dir
 from soma_core.plugin.discovery import CORE_PACKAGE
 from soma_core.plugin.options import checked_options
-from soma_core.testing.check import CheckFailedError, check
+from soma_core.testing.conformance import CheckFailedError, check
 from soma_core.testing.context import Context
-from soma_core.testing.import_probe import probe_import
 
 __all__ = ["CHECKS"]
 
@@ -25,7 +24,7 @@ _HEAVY = ("torch", "warp", "pxr", "trimesh", "jax", "tensorflow")
 @check("import-light", level="core", needs=("declares",))
 def import_light(context: Context) -> None:
     """Importing and declaring loads no heavy library."""
-    probe = probe_import(context.offer)
+    probe = context.import_probe
     loaded = [name for name in _HEAVY if name in probe.packages]
     if probe.error or loaded:
         raise CheckFailedError(
@@ -39,7 +38,7 @@ def import_light(context: Context) -> None:
 @check("import-silent", level="core", needs=("declares",))
 def import_silent(context: Context) -> None:
     """Importing and declaring writes nothing and warns of nothing."""
-    output = probe_import(context.offer).output
+    output = context.import_probe.output
     if output:
         raise CheckFailedError(
             f"import of {context.offer.target}",
@@ -86,7 +85,7 @@ def config_composes(context: Context) -> None:
         )
 
 
-@check("config-complete", level="core", needs=("config-composes", "options"))
+@check("config-complete", level="core", needs=("config-composes", "options", "parameter-defaults"))
 def config_complete(context: Context) -> None:
     """The config lists every parameter and option, with the defaults of Python."""
     config = OmegaConf.to_container(_composed(context))

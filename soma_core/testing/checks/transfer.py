@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
+import copy
+
 import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
 
 from soma_core.geometry.barycentric import closest_point_on_triangle
-from soma_core.testing.check import CheckFailedError, check
-from soma_core.testing.context import CPU, Context
+from soma_core.testing.conformance import CheckFailedError, check
+from soma_core.testing.context import Context
 from soma_core.topology.closest import ClosestFaces
-from soma_core.topology.correspondence import build_correspondence
-from soma_core.topology.transfer import make_transfer
 from soma_core.topology.wrap_pair import canonical_edges
 
 __all__ = ["CHECKS"]
@@ -19,12 +19,12 @@ __all__ = ["CHECKS"]
 _WRAP_M = 2e-4
 """Metres: what the default body may differ from the native OBJ, twice: its face may turn too."""
 
-_COVERED = 0.015
-"""Distance of native vertices to the transferred body, relative to stature, for most of them: 25 mm of 1.7 m;
-teeth, tongue and the inside of the nose have no canonical counterpart."""
-_COVERED_SHARE = 0.98
-_UNCOVERED = 0.06
-"""The same for every native vertex: 10 cm is a limb, a hat or a tail that the wrap misses."""
+_NEAR = 0.015
+"""Distance of native vertices to the transferred body, relative to stature: 25 mm of 1.7 m."""
+_MISSED = 0.02
+"""Part of the native vertices that may lie further: teeth and the inside of the nose have no counterpart."""
+_FAR = 0.06
+"""What no native vertex may exceed: 10 cm of 1.7 m is a limb, a hat or a tail that the wrap misses."""
 
 _STRETCH = 6.0
 """Times that an edge may be longer or shorter than on the default body, for bodies of equal size: newborns
@@ -67,18 +67,18 @@ def _refuse_uncovered(context: Context, native: np.ndarray, body: np.ndarray) ->
     closest = closest_point_on_triangle(native[used], body[triangles[face]])
     distance = np.linalg.norm(native[used] - closest, axis=1)
     stature = float(np.ptp(body[:, 1]))
-    most, worst = float(np.quantile(distance, _COVERED_SHARE)), int(distance.argmax())
-    if most > _COVERED * stature or distance[worst] > _UNCOVERED * stature:
+    missed, worst = float((distance > _NEAR * stature).mean()), int(distance.argmax())
+    if missed > _MISSED or distance[worst] > _FAR * stature:
         raise CheckFailedError(
             f"native vertex {used[worst]} of the default body",
-            got=f"{1000 * distance[worst]:.0f} mm from the transferred body, "
-            f"{_COVERED_SHARE:.0%} of the vertices within {1000 * most:.0f} mm",
-            expected=f"at most {1000 * _UNCOVERED * stature:.0f} mm and {1000 * _COVERED * stature:.0f} mm",
+            got=f"{1000 * distance[worst]:.0f} mm to the transferred body, and {missed:.1%} of the vertices "
+            f"further than {1000 * _NEAR * stature:.0f} mm",
+            expected=f"at most {1000 * _FAR * stature:.0f} mm, and {_MISSED:.0%}",
             fix="The wrap misses this part: register it there, or take the part out of the native OBJ.",
         )
 
 
-@check("transfer-random", needs=("stature", "batch-invariant"))
+@check("transfer-random", needs=("stature",))
 def transfer_random(context: Context) -> None:
     """Random bodies keep the neighbourhoods of the default body."""
     start, end = canonical_edges(context.mesh)
@@ -100,9 +100,7 @@ def transfer_random(context: Context) -> None:
 @check("similarity-equivariant", needs=("stature",))
 def similarity_equivariant(context: Context) -> None:
     """Turning, scaling and moving the native body does the same to the canonical one."""
-    wrap = context.wrap if context.spec.wrap else None
-    correspondence = wrap and build_correspondence(wrap.native, wrap.native_triangles, wrap.vertices)
-    transfer = make_transfer(context.spec, context.mesh, correspondence, dtype=torch.float32, device=CPU)
+    transfer = copy.deepcopy(context.layer.rest_shape.transfer).float()
     frame = context.native_frame
     turn = torch.as_tensor(Rotation.from_rotvec([0.9, -0.5, 0.7]).as_matrix())
     native_turn = torch.as_tensor(np.linalg.inv(frame)) @ turn @ torch.as_tensor(frame)
