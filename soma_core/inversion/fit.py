@@ -37,9 +37,6 @@ _CHUNK = 512
 _POSED_AT_A_TIME = 32
 """Frames whose reconstruction is compared at a time, so that it stays in cache."""
 
-_CONVERGED = 1e-3
-"""A fit has converged when its last step asked no joint to turn further than this [rad]."""
-
 _SCALES = (0.2, 5.0)
 """A body this much smaller or larger than its identity is in another unit, or no body."""
 
@@ -57,7 +54,8 @@ class PoseInversion(torch.nn.Module):
         layer: makes identities, and poses them; its LOD is the LOD of the fit.
         stages: what to do, in order: ``procrustes`` starts, ``gauss_newton`` refines.
         iterations: largest number of steps of ``gauss_newton``.
-        tolerance: a group of frames is done when no joint is asked to turn further [rad].
+        tolerance: a frame has converged when a step changes its root mean square error, squared, by less than
+            this, squared [m].
         kernels: ``torch`` (the reference), ``warp`` or ``auto``.
 
     Raises:
@@ -69,8 +67,8 @@ class PoseInversion(torch.nn.Module):
         layer: SomaLayer,
         *,
         stages: Sequence[Stage] = ("procrustes", "gauss_newton"),
-        iterations: int = 10,
-        tolerance: float = 1e-5,
+        iterations: int = 12,
+        tolerance: float = 5e-5,
         kernels: Literal["auto", "torch", "warp"] = "auto",
     ) -> None:
         super().__init__()
@@ -81,7 +79,7 @@ class PoseInversion(torch.nn.Module):
                     "stages", got=repr(stage), expected=f"among {names}", fix="Correct the name."
                 )
         if iterations < 0:
-            raise InputError("iterations", got=iterations, expected="at least 0", fix="Pass iterations=10.")
+            raise InputError("iterations", got=iterations, expected="at least 0", fix="Pass iterations=12.")
         self.layer, self.stages = layer, tuple(stages)
         self.iterations, self.tolerance = iterations, tolerance
         # Not measured on CUDA, where one thread would hold a whole frame: the dense reference runs there.
@@ -191,7 +189,7 @@ class PoseInversion(torch.nn.Module):
             vertex_error=error,
             valid=usable,
             determined=self._determined(extent > _COLLAPSED) & usable[:, None],
-            converged=(pose.last_step < _CONVERGED) & usable,
+            converged=(pose.last_change < self.tolerance) & usable,
             iterations=pose.accepted,
             residual=residual,
         ), scale

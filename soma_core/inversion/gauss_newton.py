@@ -82,8 +82,8 @@ class GaussNewton(torch.nn.Module):
             rest: moments of one identity or of one a frame.
             start: poses to begin from.
             iterations: number of steps tried; a step that would raise the energy is undone and damped.
-            tolerance: the Warp twin stops a group of frames when no joint is asked to turn further than
-                this [rad]; the reference takes every step, so that it waits for no device.
+            tolerance: the Warp twin leaves a group of frames when a step changes their energies by less,
+                as a root mean square [m]; the reference takes every step, so that it waits for no device.
         """
         if self.plan is not None:
             return self._by_warp(target, rest, start, iterations, tolerance)
@@ -91,7 +91,8 @@ class GaussNewton(torch.nn.Module):
         pose = start
         turns, places = self.walk(pose, rest.offsets)
         residual = self.gradient(turns, places, second, target)
-        damping = torch.full_like(pose.last_step, _START_DAMPING)
+        mass = rest.own[..., 3, 3].sum(1)
+        damping = torch.full_like(pose.last_change, _START_DAMPING)
         for _ in range(iterations):
             matrix, slope = self.normal_equations(turns, places, rest.second, residual)
             step = self._solve(matrix, slope, damping)
@@ -106,7 +107,7 @@ class GaussNewton(torch.nn.Module):
                 relative=torch.where(keep, trial.relative, pose.relative),
                 translation=torch.where(better[:, None], trial.translation, pose.translation),
                 accepted=pose.accepted + better,
-                last_step=step[:, :-1].norm(dim=-1).amax(1),
+                last_change=(energy.abs() / mass).sqrt(),
             )
             turns = torch.where(keep, trial_turns, turns)
             places = torch.where(keep[..., 0], trial_places, places)
@@ -119,16 +120,17 @@ class GaussNewton(torch.nn.Module):
     ) -> Pose:
         from soma_core.kernels.gauss_newton_wp import gauss_newton
 
-        relative, translation, accepted, last_step = gauss_newton(
+        mass = rest.own[..., 3, 3].sum(1)
+        relative, translation, accepted, energy = gauss_newton(
             self.plan, target, rest.second, rest.offsets, start.relative, start.translation,
             iterations=iterations, damping=(_START_DAMPING, _LOWER, _RAISE), longest=_LONGEST_STEP,
-            tolerance=tolerance,
+            threshold=tolerance**2 * float(mass.min()),
         )  # fmt: skip
         return Pose(
             relative=relative,
             translation=translation,
             accepted=start.accepted + accepted.to(start.accepted),
-            last_step=last_step,
+            last_change=(energy.abs() / mass).sqrt(),
         )
 
     def dense(self, second: Tensor) -> Tensor:

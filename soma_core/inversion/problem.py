@@ -42,14 +42,14 @@ class Pose:
         relative: T-pose-relative rotations, the root's included, (F, J, 3, 3).
         translation: Hips position about the problem's origin, (F, 3) [m].
         accepted: number of steps taken, (F,).
-        last_step: largest joint turn that the last step asked for, (F,) [rad]: its size tells how far the
-            minimum may still be. Infinite before any step.
+        last_change: how much the last step changed the energy, whether it was taken or not, as a root mean
+            square over the vertices' weights, (F,) [m]. Infinite before any step.
     """
 
     relative: Tensor
     translation: Tensor
     accepted: Tensor
-    last_step: Tensor
+    last_change: Tensor
 
     @classmethod
     def begin(cls, relative: Tensor, translation: Tensor) -> Pose:
@@ -59,5 +59,5 @@ class Pose:
             relative=relative,
             translation=translation,
             accepted=torch.zeros(count, dtype=torch.int64, device=device),
-            last_step=torch.full((count,), torch.inf, dtype=relative.dtype, device=device),
+            last_change=torch.full((count,), torch.inf, dtype=relative.dtype, device=device),
         )

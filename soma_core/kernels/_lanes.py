@@ -59,9 +59,24 @@ def lane_types(scalar: str, lanes: int) -> SimpleNamespace:
             x[c] = wp.max(x[c], y[c])
         return x
 
+    @wp.func
+    def most(x: vec):
+        """Largest magnitude."""
+        largest = real(0.0)
+        for c in range(width):
+            largest = wp.max(largest, wp.abs(x[c]))
+        return largest
+
     return SimpleNamespace(
-        real=real, vec=vec, lanes=lanes, root=root, inverse_root=inverse_root, below=below, larger=larger
-    )
+        most=most,
+        real=real,
+        vec=vec,
+        lanes=lanes,
+        root=root,
+        inverse_root=inverse_root,
+        below=below,
+        larger=larger,
+    )  # fmt: skip
 
 
 def to_lanes(frames: Tensor, lanes: int) -> Tensor:

@@ -28,6 +28,7 @@ def _kernel(scalar: str, lanes: int, *, shared: bool):
     assembly, factor = assembly_functions(scalar, lanes, shared=shared), factor_functions(scalar, lanes)
     state = _state(scalar, lanes)
     damp, change, accept = _damp(types, state), _change(types, state), _accept(types, state)
+    energy_change = _energy_change(types, state)
     module = wp.get_module(f"soma_gauss_newton_{scalar}_{lanes}_{'one' if shared else 'each'}")
     # Unrolled, the kernel takes three times as long to compile and is no faster.
     module.options.update({"enable_backward": False, "max_unroll": 2})
@@ -35,8 +36,8 @@ def _kernel(scalar: str, lanes: int, *, shared: bool):
     @wp.kernel(module=module, enable_backward=False)
     def solve(
         plan: Plan, s: state, iterations: int, start_damping: real, lower: real, higher: real,
-        longest: real, tolerance: real, second: constants, offsets: constants, target: frames,
-        relative: frames, hips: frames, accepted: frames, last_step: frames,
+        longest: real, threshold: real, second: constants, offsets: constants, target: frames,
+        relative: frames, hips: frames, accepted: frames, last_change: frames,
     ):  # fmt: skip
         w = wp.tid()
         for g in range(w, target.shape[0], s.turns.shape[0]):
@@ -54,7 +55,7 @@ def _kernel(scalar: str, lanes: int, *, shared: bool):
                 s.residual[w, i] -= target[g, i]
             damping = vec(start_damping)
             count = vec(real(0.0))
-            largest = vec(real(0.0))
+            energy = vec(real(0.0))
             for _ in range(iterations):
                 assembly.moments(w, g, plan, second, s.turns, s.places, s.column, s.blocks, s.root)
                 assembly.finish(w, plan, s.blocks)
@@ -62,13 +63,11 @@ def _kernel(scalar: str, lanes: int, *, shared: bool):
                 damp(w, plan, damping, s)
                 factor.factorise(w, plan, s.blocks, s.carry, s.last, s.inverse)
                 factor.solve(w, plan, s.blocks, s.carry, s.last, s.inverse, s.slope)
-                largest = vec(real(0.0))
                 for k in range(plan.joint.shape[0]):
                     x = -s.slope[w, 3 * k]
                     y = -s.slope[w, 3 * k + 1]
                     z = -s.slope[w, 3 * k + 2]
                     length = types.root(wp.cw_mul(x, x) + wp.cw_mul(y, y) + wp.cw_mul(z, z))
-                    largest = types.larger(largest, length)
                     short = wp.cw_div(vec(longest), types.larger(length, vec(longest)))
                     tree.retract(
                         w, plan.joint[k], plan.parent[k], wp.cw_mul(x, short), wp.cw_mul(y, short),
@@ -81,20 +80,19 @@ def _kernel(scalar: str, lanes: int, *, shared: bool):
                 )
                 change(w, plan, s.trial_turns, s.trial_places, s)
                 tree.times_second(w, g, plan.pairs, second, s.change, s.product)
-                better = accept(w, s)
+                energy = energy_change(w, s)
+                better = types.below(energy, real(0.0))
+                accept(w, better, s)
                 count += better
                 damping = wp.cw_mul(damping, vec(higher) + (lower - higher) * better)
-                remaining = real(0.0)
-                for c in range(types.lanes):
-                    remaining = wp.max(remaining, largest[c])
-                if remaining < tolerance:
+                if types.most(energy) < threshold:
                     break
             for i in range(relative.shape[1]):
                 relative[g, i] = s.relative[w, i]
             for r in range(3):
                 hips[g, r] = s.hips[w, r]
             accepted[g, 0] = count
-            last_step[g, 0] = largest
+            last_change[g, 0] = energy
 
     return solve
 
@@ -186,16 +184,26 @@ def _change(types, state):
     return change
 
 
-def _accept(types, state):
-    real, vec, below = types.real, types.vec, types.below
+def _energy_change(types, state):
+    real, vec = types.real, types.vec
 
     @wp.func
-    def accept(w: int, s: state):
-        """Take the trial in the lanes where it lowers the energy; one there, zero elsewhere."""
+    def energy_change(w: int, s: state):
+        """Exact change of the energy by the trial step, free of cancellation."""
         energy = vec(real(0.0))
         for i in range(s.change.shape[1]):
             energy += wp.cw_mul(s.change[w, i], s.product[w, i] + real(2.0) * s.residual[w, i])
-        better = below(energy, real(0.0))
+        return energy
+
+    return energy_change
+
+
+def _accept(types, state):
+    vec = types.vec
+
+    @wp.func
+    def accept(w: int, better: vec, s: state):
+        """Take the trial in the lanes where `better` is one; keep the state where it is zero."""
         for i in range(s.change.shape[1]):
             s.residual[w, i] += wp.cw_mul(better, s.product[w, i])
         for i in range(s.relative.shape[1]):
@@ -205,7 +213,6 @@ def _accept(types, state):
             s.places[w, i] += wp.cw_mul(better, s.trial_places[w, i] - s.places[w, i])
         for r in range(3):
             s.hips[w, r] += wp.cw_mul(better, s.trial_hips[w, r] - s.hips[w, r])
-        return better
 
     return accept
 
@@ -246,9 +253,9 @@ class GaussNewtonPlan:
 
 def gauss_newton(
     plan: GaussNewtonPlan, target: Tensor, second: Tensor, offsets: Tensor, relative: Tensor, hips: Tensor,
-    *, iterations: int, damping: tuple[float, float, float], longest: float, tolerance: float,
+    *, iterations: int, damping: tuple[float, float, float], longest: float, threshold: float,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:  # fmt: skip
-    """Refined rotations (F, J, 3, 3), Hips (F, 3) [m], accepted steps (F,) and last step (F,) [rad].
+    """Refined rotations (F, J, 3, 3), Hips (F, 3) [m], accepted steps (F,), last energy change (F,) [m^2].
 
     Args:
         plan: index lists of the rig.
@@ -257,7 +264,7 @@ def gauss_newton(
         offsets: (1 or F, J, 3) [m].
         relative, hips: where to begin.
         iterations, damping (start, lower, raise), longest [rad]: as in the torch twin.
-        tolerance: a group of frames is done when none of its joints is asked to turn further [rad].
+        threshold: a group of frames is done when a step changes none of their energies by more [m^2].
     """
     count, scalar, lanes = len(target), scalar_name(target.dtype), lane_count(target)
     shared = len(second) == 1 and len(offsets) == 1
@@ -279,7 +286,7 @@ def gauss_newton(
         with launching(target) as device:
             wp.launch(
                 kernel, dim=workers,
-                inputs=[plan.plan, state, iterations, *damping, longest, tolerance, *numbers,
+                inputs=[plan.plan, state, iterations, *damping, longest, threshold, *numbers,
                         *(as_lanes(one[part], types) for one in (*groups, *outputs))],
                 device=device,
             )  # fmt: skip
