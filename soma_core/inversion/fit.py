@@ -12,6 +12,7 @@ from torch import Tensor
 
 from soma_core.errors import InputError
 from soma_core.inversion._inputs import check_vertices, check_weights, refuse_unit_error
+from soma_core.inversion.comparison import compare, part_of
 from soma_core.inversion.gauss_newton import GaussNewton
 from soma_core.inversion.moments import RestMoments, SkinMoments
 from soma_core.inversion.problem import Pose, Problem
@@ -33,9 +34,6 @@ _STAGES: tuple[Stage, ...] = ("procrustes", "gauss_newton")
 
 _CHUNK = 512
 """Frames fitted at a time: enough to fill the SIMD lanes of every core, little enough for memory."""
-
-_POSED_AT_A_TIME = 32
-"""Frames whose reconstruction is compared at a time, so that it stays in cache."""
 
 _SCALES = (0.2, 5.0)
 """A body this much smaller or larger than its identity is in another unit, or no body."""
@@ -83,7 +81,7 @@ class PoseInversion(torch.nn.Module):
         self.layer, self.stages = layer, tuple(stages)
         self.iterations, self.tolerance = iterations, tolerance
         # Not measured on CUDA, where one thread would hold a whole frame: the dense reference runs there.
-        warp = kernels == "warp" or (kernels == "auto" and layer.device.type == "cpu")
+        self.warp = warp = kernels == "warp" or (kernels == "auto" and layer.device.type == "cpu")
         structure = moment_structure(layer.mesh, layer.rig)
         kind = {"dtype": layer.dtype, "device": layer.device}
         self.moments = SkinMoments(structure, layer.rig, warp=warp, **kind)
@@ -135,7 +133,7 @@ class PoseInversion(torch.nn.Module):
         parts, scales = [], []
         for first in range(0, count, _CHUNK) or (0,):
             chunk = slice(first, first + _CHUNK)
-            who, weight = _part(identity, chunk), weights[chunk] if len(weights) > 1 else weights
+            who, weight = part_of(identity, chunk), weights[chunk] if len(weights) > 1 else weights
             part, scale = self._fit(vertices[chunk], who, weight, rest or self.prepare(who, weight))
             parts.append(part)
             scales.append(scale)
@@ -181,8 +179,8 @@ class PoseInversion(torch.nn.Module):
         eye = torch.eye(3, dtype=vertices.dtype, device=vertices.device)
         relative = torch.where(usable[:, None, None, None], pose.relative, eye)[:, 1:]
         translation = torch.where(usable[:, None], pose.translation + origin, torch.zeros_like(origin))
-        error, residual = self._compare(problem, relative, translation)
-        error = torch.where(usable[:, None], error, torch.nan)
+        error, residual = compare(self.layer.animation, problem, relative, translation, warp=self.warp)
+        error.masked_fill_(~usable[:, None], torch.nan)
         return InversionResult(
             rotations=relative,
             translation=translation,
@@ -222,34 +220,6 @@ class PoseInversion(torch.nn.Module):
         all_joints = kept.new_zeros(len(kept), self.layer.rig.joint_count)
         all_joints[:, self.moments.joints] = kept
         return all_joints[:, 1:]
-
-    def _compare(self, problem: Problem, relative: Tensor, translation: Tensor) -> tuple[Tensor, Tensor]:
-        """Vertex errors (F, v) [m] under the forward model, and their weighted root mean square (F,)."""
-        vertices, weights = problem.vertices, problem.weights
-        error = vertices.new_empty(vertices.shape[:2])
-        for first in range(0, len(vertices), _POSED_AT_A_TIME):
-            chunk = slice(first, first + _POSED_AT_A_TIME)
-            posed = self.layer.animation.pose(
-                _part(problem.identity, chunk), relative[chunk], translation[chunk], absolute=False
-            )
-            step = posed.vertices.sub_(vertices[chunk])
-            torch.linalg.vector_norm(step, dim=-1, out=error[chunk])
-        total = weights.sum(1).clamp_min(torch.finfo(weights.dtype).tiny)
-        return error, ((error * error * weights).sum(1) / total).sqrt()
-
-
-def _part(identity: Identity, chunk: slice) -> Identity:
-    """The identities of a chunk of frames; one identity serves every chunk."""
-    if identity.batch_size == 1:
-        return identity
-    return replace(
-        identity,
-        rest=identity.rest[chunk],
-        bind_world=identity.bind_world[chunk],
-        fitted_rest=identity.fitted_rest[chunk],
-        fitted_world=identity.fitted_world[chunk],
-        params={name: value[chunk] for name, value in identity.params.items()},
-    )
 
 
 def _without_gaps(vertices: Tensor, weights: Tensor, layer: SomaLayer) -> tuple[Tensor, Tensor]:

@@ -1,0 +1,75 @@
+"""How far a reconstruction under the forward model lies from its target."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from soma_core.animation.engine import Animation
+from soma_core.animation.skinning import skinning_transforms
+from soma_core.inversion.problem import Problem
+from soma_core.skeleton.identity import Identity
+
+__all__ = ["compare", "part_of"]
+
+_POSED_AT_A_TIME = 32
+"""Frames posed and compared at a time by the reference, so that they stay in cache."""
+
+
+def compare(
+    animation: Animation, problem: Problem, relative: Tensor, translation: Tensor, *, warp: bool
+) -> tuple[Tensor, Tensor]:
+    """Vertex errors (F, v) [m] and their weighted root mean square (F,) [m].
+
+    Args:
+        animation: the forward model.
+        problem: targets, weights and identity.
+        relative: user joints' rotations (F, J - 1, 3, 3).
+        translation: Hips positions (F, 3) [m], in the world.
+        warp: run the Warp twin where one identity and one set of weights serve all frames.
+    """
+    identity, weights = problem.identity, problem.weights
+    if warp and identity.batch_size == 1 and len(weights) == 1:
+        error, total = _by_warp(animation, problem, relative, translation)
+    else:
+        error = problem.vertices.new_empty(problem.vertices.shape[:2])
+        for first in range(0, len(error), _POSED_AT_A_TIME):
+            chunk = slice(first, first + _POSED_AT_A_TIME)
+            posed = animation.pose(
+                part_of(identity, chunk), relative[chunk], translation[chunk], absolute=False
+            )
+            step = posed.vertices.sub_(problem.vertices[chunk])
+            torch.linalg.vector_norm(step, dim=-1, out=error[chunk])
+        total = (error * error * weights).sum(1)
+    return error, (total / weights.sum(1).clamp_min(torch.finfo(weights.dtype).tiny)).sqrt()
+
+
+def _by_warp(
+    animation: Animation, problem: Problem, relative: Tensor, translation: Tensor
+) -> tuple[Tensor, Tensor]:
+    from soma_core.kernels.skin_error_wp import skin_error
+
+    identity, weights = problem.identity, animation.skinning.weights
+    kinematics = animation.kinematics
+    offsets = kinematics.local_offsets(identity.bind_world)
+    rotations, positions = kinematics(relative, offsets, translation)
+    transforms = skinning_transforms(rotations, positions, identity.bind_world)
+    rest = torch.cat((identity.rest[0], torch.ones_like(identity.rest[0, :, :1])), 1)
+    point = weights.val[:, None] * rest[animation.skinning.influence_vertex]
+    return skin_error(weights.crow, weights.col, point, problem.weights[0], transforms, problem.vertices)
+
+
+def part_of(identity: Identity, chunk: slice) -> Identity:
+    """The identities of a chunk of frames; one identity serves every chunk."""
+    if identity.batch_size == 1:
+        return identity
+    return replace(
+        identity,
+        rest=identity.rest[chunk],
+        bind_world=identity.bind_world[chunk],
+        fitted_rest=identity.fitted_rest[chunk],
+        fitted_world=identity.fitted_world[chunk],
+        params={name: value[chunk] for name, value in identity.params.items()},
+    )
