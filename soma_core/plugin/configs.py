@@ -18,12 +18,12 @@ class PluginConfigs:
     """Config folders of the installed plugins.
 
     Attributes:
-        folders: (distribution, folder) of those that hydra may search.
+        folders: those that hydra may search, and who ships each.
         clashes: file in the search path, such as ``backend/acme.yaml`` -> why the folders that hold it are
             left out. A file in such a folder that clashes with nothing is listed too.
     """
 
-    folders: tuple[tuple[str, Path], ...]
+    folders: dict[Path, Offer]
     clashes: dict[str, BackendConflictError]
 
 
@@ -54,9 +54,7 @@ def find_configs(offers: Iterable[Offer], *, core: str) -> PluginConfigs:
             for folder in folders:
                 reasons.setdefault(folder, error)
     return PluginConfigs(
-        folders=tuple(
-            (offer.distribution, folder) for folder, offer in owners.items() if folder not in reasons
-        ),
+        folders={folder: offer for folder, offer in owners.items() if folder not in reasons},
         clashes={file: reasons[folders[0]] for file, folders in shipped.items() if folders[0] in reasons},
     )
 

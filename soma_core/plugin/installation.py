@@ -7,7 +7,6 @@ import json
 import re
 import shlex
 from urllib.parse import urlsplit
-from urllib.request import url2pathname
 
 from soma_core.plugin.discovery import CORE_DISTRIBUTION
 
@@ -20,6 +19,8 @@ _CORE = re.compile(
 
 def local_source(distribution: str) -> tuple[str, bool] | None:
     """Folder or file that pip installed from, and whether it is editable; None: an index, or not by pip."""
+    from urllib.request import url2pathname  # brings the whole HTTP client along
+
     try:
         text = importlib.metadata.distribution(distribution).read_text("direct_url.json")
         document = json.loads(text or "null")

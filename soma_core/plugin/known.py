@@ -11,10 +11,11 @@ KNOWN_BACKENDS = {
     "smpl": "soma-backend-smpl",
     "smplh": "soma-backend-smpl",
     "smplx": "soma-backend-smpl",
+    "toy": "soma-backend-toy",
 }
 """Backend name -> the distribution that provides it, or will: none is published on an index yet."""
 
-_IN_CHECKOUT = {"anny": "./plugins/anny"}
+_IN_CHECKOUT = {"anny": "./plugins/anny", "toy": "./plugins/toy"}
 """Backend name -> its folder in this repository."""
 
 

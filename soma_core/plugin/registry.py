@@ -201,6 +201,10 @@ class Registry:
 
         Left out are blocked and conflicting backends, and plugins that ship a file of the same name.
         """
+        return tuple((offer.distribution, folder) for folder, offer in self.config_offers().items())
+
+    def config_offers(self) -> Mapping[Path, Offer]:
+        """Return the same folders, each with the offer that it comes from."""
         return self._configs.folders
 
     def config_clashes(self) -> Mapping[str, BackendConflictError]:

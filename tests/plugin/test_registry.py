@@ -268,6 +268,7 @@ def test_unknown_name_suggests_the_closest() -> None:
         ("smplh", "smpl"),
         ("smplx", "smpl"),
         ("garment", "garment"),
+        ("toy", "toy"),
     ],
 )
 def test_unknown_but_known_of_names_the_distribution(name: str, line: str) -> None:

@@ -1,0 +1,138 @@
+"""What hydra and OmegaConf refuse, in our words: the full key or the plugin's file, and how to mend it."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+from hydra.core.hydra_config import HydraConfig
+from hydra.errors import HydraException, MissingConfigException, OverrideParseException
+from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import ConfigAttributeError, ConfigKeyError, OmegaConfBaseException
+from yaml import YAMLError
+
+from soma_core.errors import InputError, SomaError
+from soma_core.plugin.declaration import did_you_mean
+from soma_core.plugin.errors import BrokenBackendError
+from soma_core.plugin.registry import default_registry
+
+__all__ = ["REFUSALS", "check_backend_choice", "in_our_words"]
+
+REFUSALS = (HydraException, YAMLError, UnicodeError)
+"""What composing a configuration may raise."""
+
+_SHOWN_KEYS = 16
+"""A backend may have hundreds of parameters; an error message lists this many."""
+
+_COMPOSING = re.compile(r"In '(?P<file>[^']+)': \w+ raised while composing config:\s*(?P<cause>[^\n]*)")
+
+
+def in_our_words(error: Exception) -> SomaError:
+    """Say what was refused while a configuration was composed, whose it is, and how to mend it."""
+    if isinstance(error, MissingConfigException):
+        return _missing_choice(error)
+    if isinstance(error, OverrideParseException):
+        return InputError(
+            error.override,
+            got=_first_line(error),
+            expected="key=value",
+            fix="Quote values with spaces, commas or brackets: 'key=\"a, b\"'",
+        )
+    if not isinstance(error, HydraException):
+        return _unreadable_file(error)
+    shipped = _COMPOSING.match(str(error))
+    if shipped:
+        return _broken_file(f"{shipped['file']}.yaml", shipped["cause"])
+    if isinstance(error.__cause__, OmegaConfBaseException):
+        return _refused_value(error.__cause__)
+    first, *rest = str(error).splitlines()
+    return InputError("configuration", got=first, expected="key=value", fix=" ".join(rest) or "See --help")
+
+
+def check_backend_choice(config: DictConfig) -> None:
+    """Refuse a composed configuration whose backend is not the one that was chosen by ``backend=NAME``.
+
+    Raises:
+        BackendError: the plugin's config names no backend, or another.
+        InputError: the command line does.
+    """
+    choice = HydraConfig.get().runtime.choices.get("backend")
+    if choice is None or (not OmegaConf.is_missing(config.backend, "name") and config.backend.name == choice):
+        return
+    if any(each.startswith("backend.name=") for each in HydraConfig.get().overrides.task):
+        raise InputError(
+            "backend.name", got=config.backend.name, expected=choice, fix="Choose a backend with backend=NAME"
+        )
+    got = "no name" if OmegaConf.is_missing(config.backend, "name") else f"name: {config.backend.name}"
+    raise _broken_file(f"backend/{choice}.yaml", f"got {got}, expected name: {choice}")
+
+
+def _missing_choice(error: MissingConfigException) -> SomaError:
+    group, _, choice = (error.missing_cfg_file or "").rpartition("/")
+    registry = default_registry()
+    clash = registry.config_clashes().get(f"{error.missing_cfg_file}.yaml")
+    if clash is not None:
+        return clash
+    if group == "backend":
+        return registry.missing_config(choice)
+    options = list(error.options or ())
+    return InputError(
+        group or "configuration",
+        got=choice or str(error),
+        expected=f"one of {', '.join(options) or 'none'}",
+        fix=did_you_mean(choice, options) or "See --help",
+    )
+
+
+def _unreadable_file(error: Exception) -> SomaError:
+    """Find the file that is not YAML among those of the plugins; hydra does not always say."""
+    for folder in default_registry().config_offers():
+        for path in sorted(folder.rglob("*.yaml")):
+            try:
+                OmegaConf.load(path)
+            except (YAMLError, UnicodeError, OSError) as reason:
+                return _broken_file(path.relative_to(folder).as_posix(), " ".join(str(reason).split()))
+    cause = " ".join(str(error).split())
+    return InputError("configuration", got=cause, expected="YAML in UTF-8", fix="Correct the file")
+
+
+def _broken_file(file: str, cause: str) -> SomaError:
+    owners = {folder / file: offer.source for folder, offer in default_registry().config_offers().items()}
+    path, source = next(
+        ((path, source) for path, source in owners.items() if path.is_file()), (Path(file), "not of a plugin")
+    )
+    return BrokenBackendError(
+        who=f'config "{file}" ({source})',
+        stage="config",
+        cause=cause.rstrip("."),
+        fix=f"Correct {path}; the keys of a backend are name, params and options",
+    )
+
+
+def _refused_value(cause: OmegaConfBaseException) -> InputError:
+    """Name the full key of an unknown key or a value of the wrong type."""
+    name = str(cause.full_key or cause.key)
+    if not isinstance(cause, ConfigKeyError | ConfigAttributeError):
+        return _wrong_type(name, _first_line(cause))
+    parent, _, key = name.rpartition(".")
+    known = [str(item) for item in cause.parent_node or () if item != "hydra"]
+    shown = known[:_SHOWN_KEYS] + [f"{len(known) - _SHOWN_KEYS} more"] * (len(known) > _SHOWN_KEYS)
+    return InputError(
+        name,
+        got="an unknown key",
+        expected=f"one of {', '.join(shown) or 'no keys'}" + (f" in {parent}" if parent else ""),
+        fix=did_you_mean(key, known) or "See --help",
+    )
+
+
+def _wrong_type(name: str, text: str) -> InputError:
+    """Take OmegaConf's sentence apart into got and expected."""
+    for separator in (", expected ", " could not be converted to "):
+        got, found, expected = text.partition(separator)
+        if found:
+            return InputError(name, got=got[0].lower() + got[1:], expected=expected, fix="See --help")
+    return InputError(name, got=text, expected="a value of the declared type", fix="See --help")
+
+
+def _first_line(error: Exception) -> str:
+    return str(error).splitlines()[0]
