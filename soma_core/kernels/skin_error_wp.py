@@ -33,11 +33,11 @@ def _kernel(scalar: str, lanes: int):
             x = vec(real(0.0))
             y = vec(real(0.0))
             z = vec(real(0.0))
-            for c in range(width):
-                f = wp.min(begin + c, last)
-                x[c] = -vertices[f, v, 0]
-                y[c] = -vertices[f, v, 1]
-                z[c] = -vertices[f, v, 2]
+            for i in range(width):
+                f = wp.min(begin + i, last)
+                x[i] = -vertices[f, v, 0]
+                y[i] = -vertices[f, v, 1]
+                z[i] = -vertices[f, v, 2]
             for e in range(wp.int32(start[v]), wp.int32(start[v + 1])):
                 k = 12 * wp.int32(joint[e])
                 a = point[e, 0]
