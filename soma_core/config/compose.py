@@ -74,10 +74,12 @@ def run_task(
 def _hydra_process(program: str, overrides: Sequence[str]) -> Iterator[None]:
     """Give hydra the command line it reads from the process, and have it raise instead of print.
 
-    HYDRA_FULL_ERROR is hydra's switch for letting exceptions through.
+    HYDRA_FULL_ERROR is hydra's switch for letting exceptions through. hydra's parser takes no overrides
+    after a flag that follows others, so the flag that users put anywhere goes first.
     """
     arguments, full_error = sys.argv, os.environ.get("HYDRA_FULL_ERROR")
-    sys.argv, os.environ["HYDRA_FULL_ERROR"] = [program, *overrides], "1"
+    ordered = sorted(overrides, key=lambda each: each not in ("--multirun", "-m"))
+    sys.argv, os.environ["HYDRA_FULL_ERROR"] = [program, *ordered], "1"
     try:
         yield
     finally:
