@@ -8,7 +8,7 @@ from torch import Tensor
 from soma_core.errors import InputError
 from soma_core.geometry.rotations import axis_angle_to_matrix, orthonormality_error
 
-__all__ = ["check_kind", "check_rotations", "check_translation"]
+__all__ = ["check_bone_scale", "check_kind", "check_rotations", "check_translation"]
 
 _ROTATION_TOLERANCE = 1e-2
 """Largest accepted entry of |R^T R - I|: above it a matrix is a mistake, not rounding."""
@@ -115,3 +115,29 @@ def check_translation(
         )
     _check_finite("translation", translation)
     return translation.expand(batch, 3)
+
+
+def check_bone_scale(
+    bone_scale: Tensor | None, batch: int, joint_count: int, dtype: torch.dtype, device: torch.device
+) -> Tensor | None:
+    """Factors (1 or batch, joints) of the bone vectors, positive; None where none are given."""
+    if bone_scale is None:
+        return None
+    check_kind("bone_scale", bone_scale, dtype, device)
+    if tuple(bone_scale.shape) not in ((1, joint_count), (batch, joint_count)):
+        raise InputError(
+            "bone_scale",
+            got=tuple(bone_scale.shape),
+            expected=f"({batch}, {joint_count}) or (1, {joint_count})",
+            fix="Give one factor a user joint, for all poses or for each; 1 leaves a bone as it is.",
+        )
+    _check_finite("bone_scale", bone_scale)
+    if _may_look(bone_scale) and not bool((bone_scale.detach() > 0).all()):
+        where = tuple(int(i) for i in torch.nonzero(bone_scale.detach() <= 0)[0])
+        raise InputError(
+            f"bone_scale[{where[0]}, {where[1]}]",
+            got=float(bone_scale.detach()[where]),
+            expected="a number above zero",
+            fix="Use 1 for a bone that keeps its length.",
+        )
+    return bone_scale

@@ -9,7 +9,7 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
-from soma_core._inputs import check_kind, check_rotations, check_translation
+from soma_core._inputs import check_bone_scale, check_kind, check_rotations, check_translation
 from soma_core.animation.engine import Animation
 from soma_core.animation.posed import Posed
 from soma_core.backends.parameters import batch_parameters
@@ -147,6 +147,7 @@ class SomaLayer(torch.nn.Module):
         translation: Tensor | None = None,
         *,
         absolute: bool = False,
+        bone_scale: Tensor | None = None,
     ) -> Posed:
         """Pose identities (paper, section 3.5.1).
 
@@ -157,9 +158,12 @@ class SomaLayer(torch.nn.Module):
                 identities.
             translation: world position of the Hips [m], (batch, 3) or (3,); default the origin.
             absolute: `rotations` are local rotations of the rig's own axes instead.
+            bone_scale: (batch, J - 1) or (1, J - 1) factors of the bone that leads to each joint, applied
+                when posing; the skin is not refitted. That of the Hips has no effect.
 
         Raises:
-            InputError: a wrong shape, dtype or device, a NaN, a matrix that is no rotation.
+            InputError: a wrong shape, dtype or device, a NaN, a matrix that is no rotation, a bone scale
+                that is not positive.
         """
         relative = check_rotations(
             rotations, len(self.joint_names), self.dtype, self.device, validate=self.validate
@@ -167,8 +171,9 @@ class SomaLayer(torch.nn.Module):
         self._check_identity(identity)
         batch = _common_batch(identity.batch_size, len(relative))
         shift = check_translation(translation, batch, self.dtype, self.device)
+        bone_scale = check_bone_scale(bone_scale, batch, len(self.joint_names), self.dtype, self.device)
         relative = relative.expand(batch, *relative.shape[1:])
-        return self.animation.pose(identity, relative, shift, absolute=absolute)
+        return self.animation.pose(identity, relative, shift, absolute=absolute, bone_scale=bone_scale)
 
     def _check_identity(self, identity: Identity) -> None:
         """Refuse an identity that another kind of layer made: other rig, LOD, dtype or device."""
@@ -189,6 +194,7 @@ class SomaLayer(torch.nn.Module):
         translation: Tensor | None = None,
         *,
         absolute: bool = False,
+        bone_scale: Tensor | None = None,
     ) -> Posed:
         """``pose(identity(params), rotations, translation)``; identities are not kept.
 
@@ -201,20 +207,22 @@ class SomaLayer(torch.nn.Module):
         identities = len(next(iter(batch.values()), relative))
         size = _common_batch(identities, len(relative))
         shift = check_translation(translation, size, self.dtype, self.device)
+        bone_scale = check_bone_scale(bone_scale, size, len(self.joint_names), self.dtype, self.device)
         relative = relative.expand(size, *relative.shape[1:])
-        tracked = torch.is_grad_enabled() and any(
-            tensor.requires_grad for tensor in (*batch.values(), relative, shift)
-        )
+        given = (*batch.values(), relative, shift, *([] if bone_scale is None else [bone_scale]))
+        tracked = torch.is_grad_enabled() and any(tensor.requires_grad for tensor in given)
         tracked = tracked or torch.compiler.is_compiling()  # a compiler plans its own memory
         whole = tracked or identities < size or size <= _CHUNK or self.animation.warp_skinning
         if whole:
             identity = self._identity(batch, *self.rest_shape(batch))
-            return self.animation.pose(identity, relative, shift, absolute=absolute)
-        parts = (
-            ({name: value[chunk] for name, value in batch.items()}, relative[chunk], shift[chunk])
-            for chunk in (slice(start, start + _CHUNK) for start in range(0, size, _CHUNK))
-        )
-        bodies = ((self._identity(part, *self.rest_shape(part)), turn, place) for part, turn, place in parts)
+            return self.animation.pose(identity, relative, shift, absolute=absolute, bone_scale=bone_scale)
+
+        def body(chunk: slice) -> tuple[Identity, Tensor, Tensor, Tensor | None]:
+            part = {name: value[chunk] for name, value in batch.items()}
+            scale = None if bone_scale is None else bone_scale.expand(size, -1)[chunk]
+            return self._identity(part, *self.rest_shape(part)), relative[chunk], shift[chunk], scale
+
+        bodies = (body(slice(start, start + _CHUNK)) for start in range(0, size, _CHUNK))
         return self.animation.pose_all(bodies, size, absolute=absolute)
 
 

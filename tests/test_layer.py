@@ -73,6 +73,10 @@ def poses(batch, dtype=torch.float64, joints=JOINTS, seed=2):
     return 0.4 * randn(batch, joints, 3, seed=seed, dtype=dtype), randn(batch, 3, seed=seed + 1, dtype=dtype)
 
 
+def bone_scales(batch, dtype=torch.float64, seed=4):
+    return (0.2 * randn(batch, JOINTS, seed=seed, dtype=dtype)).exp()
+
+
 def outputs(posed):
     return posed.vertices, posed.joints, posed.transforms
 
@@ -102,11 +106,13 @@ def test_shapes_and_provenance(tiny):
     assert layer.joint_names == layer.rig.joint_names[1:]
 
 
-def test_equals_the_dense_definition(tiny):
+@pytest.mark.parametrize("scales", [0, 1, 2])
+def test_equals_the_dense_definition(tiny, scales):
     """Naive forward kinematics and skinning of the identity the layer prepared."""
     layer = tiny()
     identity, (turns, place) = layer.identity(params(2)), poses(2)
-    posed = layer.pose(identity, turns, place)
+    posed = layer.pose(identity, turns, place, bone_scale=bone_scales(scales) if scales else None)
+    factor = bone_scales(scales).expand(2, -1).numpy() if scales else np.ones((2, JOINTS))
     rig, orient = layer.rig, layer.rig.t_pose_world[:, :3, :3]
     for index in range(2):
         bind = identity.bind_world[index].numpy()
@@ -116,7 +122,7 @@ def test_equals_the_dense_definition(tiny):
             local = np.linalg.inv(bind[parent]) @ bind[joint]
             turn = axis_angle_to_matrix(turns[index, joint - 1]).numpy()
             local[:3, :3] = orient[parent].T @ turn @ orient[joint]
-            local[:3, 3] = place[index] if joint == 1 else local[:3, 3]
+            local[:3, 3] = place[index] if joint == 1 else factor[index, joint - 1] * local[:3, 3]
             world[joint] = world[parent] @ local
         np.testing.assert_allclose(posed.transforms[index], world, atol=1e-10)
         blended = np.einsum("vj,jab->vab", rig.weights.toarray(), world @ np.linalg.inv(bind))
@@ -307,13 +313,15 @@ def test_large_batches_are_small_ones(tiny, batch, kernels):
         params(batch, torch.float32),
         poses(batch, torch.float32),
     )
+    scale = bone_scales(batch, torch.float32)
     with torch.no_grad():
-        plain = layer(given, turns, place)
-    tracked = layer(given, turns.clone().requires_grad_(), place)
+        plain = layer(given, turns, place, bone_scale=scale)
+    tracked = layer(given, turns.clone().requires_grad_(), place, bone_scale=scale)
     assert_posed(plain, tracked, 4 * SAME[torch.float32])
     for index in (0, batch // 2, batch - 1):
         part = slice(index, index + 1)
-        alone = layer({name: value[part] for name, value in given.items()}, turns[part], place[part])
+        one = {name: value[part] for name, value in given.items()}
+        alone = layer(one, turns[part], place[part], bone_scale=scale[part])
         for whole, single in zip(outputs(plain), outputs(alone), strict=True):
             torch.testing.assert_close(whole[part], single, atol=4 * SAME[torch.float32], rtol=0)
 
@@ -462,10 +470,11 @@ def test_gradcheck_through_everything(tiny, form, kernels):
     layer, given, (turns, place) = tiny(torch.float64, kernels), params(2), poses(2)
     turns = turns if form == "axis-angle" else axis_angle_to_matrix(turns)
     layer = layer if form == "axis-angle" else tiny(torch.float64, kernels, validate=False)
-    leaves = [part.requires_grad_() for part in (given["shape"], given["size"], turns, place)]
+    parts = given["shape"], given["size"], turns, place, bone_scales(2)
+    leaves = [part.requires_grad_() for part in parts]
 
-    def run(shape, size, rotations, translation):
-        return outputs(layer({"shape": shape, "size": size}, rotations, translation))
+    def run(shape, size, rotations, translation, scale):
+        return outputs(layer({"shape": shape, "size": size}, rotations, translation, bone_scale=scale))
 
     assert torch.autograd.gradcheck(run, leaves, fast_mode=True, atol=1e-6)
 
@@ -841,6 +850,24 @@ def test_translation_that_is_not_finite(tiny, validate):
     place[1, 2] = torch.nan
     with pytest.raises(InputError, match=r"translation: got nan at index \(1, 2\), expected finite"):
         tiny(validate=validate)(params(2), rotations_of(2, JOINTS, 3), place)
+
+
+def test_wrong_bone_scales(tiny):
+    layer, turns = tiny(), rotations_of(2, JOINTS, 3)
+    identity = layer.identity(params(2))
+    for scale, text in (
+        (torch.ones(JOINTS, dtype=torch.float64), rf"got \({JOINTS},\), expected \(2, {JOINTS}\) or \(1, "),
+        (torch.ones(3, JOINTS, dtype=torch.float64), rf"got \(3, {JOINTS}\), expected \(2, {JOINTS}\)"),
+        (torch.ones(2, JOINTS), "got torch.float32, expected torch.float64"),
+        (torch.full((1, JOINTS), torch.inf, dtype=torch.float64), r"got inf at index \(0, 0\), expected fin"),
+    ):
+        for call in (functools.partial(layer.pose, identity), functools.partial(layer, params(2))):
+            with pytest.raises(InputError, match=f"bone_scale: {text}"):
+                call(turns, bone_scale=scale)
+    scale = torch.ones(2, JOINTS, dtype=torch.float64)
+    scale[1, 3] = -0.5
+    with pytest.raises(InputError, match=r"bone_scale\[1, 3\]: got -0.5, expected a number above zero"):
+        layer.pose(identity, turns, bone_scale=scale)
 
 
 def test_wrong_parameters(tiny):

@@ -54,9 +54,31 @@ class Animation(torch.nn.Module):
             skinned = self.skinning(points, transforms, rows=False)
         return skinned, to_homogeneous(rotations, positions)
 
-    def pose(self, identity: Identity, relative: Tensor, translation: Tensor, *, absolute: bool) -> Posed:
-        """Posed bodies; `relative` (B, J - 1, 3, 3) and `translation` (B, 3) [m] are already checked."""
-        rotations, positions = self._walk(identity, relative, translation, absolute=absolute)
+    def bone_vectors(self, identity: Identity, bone_scale: Tensor | None = None) -> Tensor:
+        """Bone vectors in T-pose world axes, (B, J, 3) [m], times `bone_scale` (1 or B, J - 1)."""
+        offsets = self.kinematics.local_offsets(identity.bind_world)
+        if bone_scale is None:
+            return offsets
+        return offsets * torch.nn.functional.pad(bone_scale, (1, 0), value=1.0)[..., None]
+
+    def pose(
+        self,
+        identity: Identity,
+        relative: Tensor,
+        translation: Tensor,
+        *,
+        absolute: bool,
+        bone_scale: Tensor | None = None,
+    ) -> Posed:
+        """Posed bodies; what is given is already checked.
+
+        Args:
+            identity: of batch 1 or B.
+            relative: (B, J - 1, 3, 3), or local rotations of the rig's own axes when `absolute`.
+            translation: Hips positions (B, 3) [m].
+            bone_scale: factors (1 or B, J - 1) of the user joints' bone vectors; the skin is not refitted.
+        """
+        rotations, positions = self._walk(identity, relative, translation, bone_scale, absolute=absolute)
         transforms = skinning_transforms(rotations, positions, identity.bind_world)
         return Posed(
             vertices=self._skin(identity.rest, transforms),
@@ -65,19 +87,21 @@ class Animation(torch.nn.Module):
         )
 
     def pose_all(
-        self, bodies: Iterable[tuple[Identity, Tensor, Tensor]], batch: int, *, absolute: bool
+        self, bodies: Iterable[tuple[Identity, Tensor, Tensor, Tensor | None]], batch: int, *, absolute: bool
     ) -> Posed:
-        """Pose a stream of (identity, relative, translation) chunks, each dropped after use; no derivative.
+        """Pose a stream of (identity, relative, translation, bone scale) chunks; no derivative.
+
+        Each is dropped after use.
 
         Args:
             bodies: chunks that add up to `batch` bodies, one identity a pose.
             batch: total number of bodies.
         """
         vertices, world, start = None, [], 0
-        for identity, relative, translation in bodies:
+        for identity, relative, translation, bone_scale in bodies:
             if vertices is None:
                 vertices = identity.rest.new_empty(batch, *identity.rest.shape[1:])
-            rotations, positions = self._walk(identity, relative, translation, absolute=absolute)
+            rotations, positions = self._walk(identity, relative, translation, bone_scale, absolute=absolute)
             transforms = skinning_transforms(rotations, positions, identity.bind_world)
             stop = start + len(relative)
             self.skinning.into(vertices[start:stop], identity.rest.permute(2, 1, 0), transforms)
@@ -87,13 +111,19 @@ class Animation(torch.nn.Module):
         return Posed(vertices=vertices, joints=joined[:, 1:, :3, 3], transforms=joined)
 
     def _walk(
-        self, identity: Identity, relative: Tensor, translation: Tensor, *, absolute: bool
+        self,
+        identity: Identity,
+        relative: Tensor,
+        translation: Tensor,
+        bone_scale: Tensor | None,
+        *,
+        absolute: bool,
     ) -> tuple[Tensor, Tensor]:
         """World rotations and positions of the joints."""
         if absolute:
             kinematics = self.kinematics
             relative = relative_from_absolute(relative, kinematics.orient[1:], kinematics.parent_orient[1:])
-        return self.kinematics(relative, self.kinematics.local_offsets(identity.bind_world), translation)
+        return self.kinematics(relative, self.bone_vectors(identity, bone_scale), translation)
 
     def _skin(self, rest: Tensor, transforms: Tensor) -> Tensor:
         """Posed vertices (B, v, 3), contiguous, from rest vertices (B or 1, v, 3)."""
