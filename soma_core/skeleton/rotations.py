@@ -97,6 +97,7 @@ class RotationFit(torch.nn.Module):
         keep("order", np.argsort(np.concatenate([single, several])))
         keep("source", plan.source + 1)
         keep("bind", bind)
+        keep("bones", bind - bind[np.maximum(rig.parents, 0)])
         keep("bind_rotation", rig.bind_world[:, :3, :3])
 
     def forward(self, joints: Tensor, covariances: Tensor) -> Tensor:
@@ -106,16 +107,25 @@ class RotationFit(torch.nn.Module):
 
             displacement = fit_displacements(joints, covariances, self.bind, self.pivots, self.child_table)
         else:
-            displacement = self._displacements(joints, covariances)
+            displacement = self.displacements(joints, covariances, self.bones)
         eye = torch.eye(3, dtype=joints.dtype, device=joints.device).expand(len(joints), 1, 3, 3)
         world = torch.cat((eye, displacement), 1)[:, self.source] @ self.bind_rotation
         return 1.5 * world - 0.5 * world @ (world.transpose(-1, -2) @ world)  # undo the products' rounding
 
-    def _displacements(self, joints: Tensor, covariances: Tensor) -> Tensor:
+    def displacements(self, joints: Tensor, covariances: Tensor, bones: Tensor) -> Tensor:
+        """Turns (B, p, 3, 3) of the pivots that take `bones`, each from a joint's parent, to `joints`.
+
+        Args:
+            joints: positions (B, J, 3).
+            covariances: (B, J, 3, 3), with points in the axes of the bones.
+            bones: (J, 3), or (B or 1, J, 3).
+        """
         initial = rotation_from_covariance(covariances[:, self.pivots])
-        first, target = self._bones(joints, initial, self.single, self.single_child)
+        bones = bones.expand(len(joints), -1, -1)
+        first, target = self._bones(joints, initial, bones, self.single, self.single_child)
         aligned = shortest_arc(first, target) @ initial[:, self.single]
-        first, target = self._bones(joints, initial, self.several[self.fan_slot], self.fan_child)
+        rank = self.several[self.fan_slot]
+        first, target = self._bones(joints, initial, bones, rank, self.fan_child)
         outer = target[..., :, None] * first[..., None, :]
         sums = outer.new_zeros(len(joints), len(self.several), 3, 3).index_add(1, self.fan_slot, outer)
         sums = sums.index_add(1, self.pair[0], self._pair_normals(first, target))
@@ -130,11 +140,12 @@ class RotationFit(torch.nn.Module):
         area = (((source * source).sum(-1) + tiny) * ((goal * goal).sum(-1) + tiny)) ** -0.25
         return area[..., None, None] * goal[..., :, None] * source[..., None, :]
 
-    def _bones(self, joints: Tensor, initial: Tensor, rank: Tensor, child: Tensor) -> tuple[Tensor, Tensor]:
-        """Bind bones turned by stage a, and fitted bones, from the pivots at `rank` to `child`."""
-        parent = self.pivots[rank]
-        bone = (self.bind[child] - self.bind[parent])[..., None]
-        return (initial[:, rank] @ bone).squeeze(-1), joints[:, child] - joints[:, parent]
+    def _bones(
+        self, joints: Tensor, initial: Tensor, bones: Tensor, rank: Tensor, child: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """Bones turned by stage a, and fitted bones, from the pivots at `rank` to `child`."""
+        turned = (initial[:, rank] @ bones[:, child, :, None]).squeeze(-1)
+        return turned, joints[:, child] - joints[:, self.pivots[rank]]
 
 
 def fit_rotations(rig: Rig, joints: Tensor, covariances: Tensor) -> Tensor:
