@@ -37,9 +37,10 @@ def compare(
         error = problem.vertices.new_empty(problem.vertices.shape[:2])
         for first in range(0, len(error), _POSED_AT_A_TIME):
             chunk = slice(first, first + _POSED_AT_A_TIME)
-            posed = animation.pose(
-                part_of(identity, chunk), relative[chunk], translation[chunk], absolute=False
-            )
+            scale, who = problem.bone_scale, part_of(identity, chunk)
+            scale = scale[chunk] if scale is not None and len(scale) > 1 else scale
+            turns, places = relative[chunk], translation[chunk]
+            posed = animation.pose(who, turns, places, absolute=False, bone_scale=scale)
             step = posed.vertices.sub_(problem.vertices[chunk])
             torch.linalg.vector_norm(step, dim=-1, out=error[chunk])
         total = (error * error * weights).sum(1)
@@ -52,9 +53,7 @@ def _by_warp(
     from soma_core.kernels.skin_error_wp import skin_error
 
     identity, weights = problem.identity, animation.skinning.weights
-    kinematics = animation.kinematics
-    offsets = kinematics.local_offsets(identity.bind_world)
-    rotations, positions = kinematics(relative, offsets, translation)
+    rotations, positions = animation.kinematics(relative, problem.rest.offsets, translation)
     transforms = skinning_transforms(rotations, positions, identity.bind_world)
     rest = torch.cat((identity.rest[0], torch.ones_like(identity.rest[0, :, :1])), 1)
     point = weights.val[:, None] * rest[animation.skinning.influence_vertex]

@@ -24,6 +24,7 @@ class Problem:
         rest: moments of the identity under the weights.
         target: ``R`` (F, T, 3, 4) of the targets, about `origin`.
         origin: (F, 3) [m]; poses under way are relative to it.
+        bone_scale: factors (1 or F, J - 1) of the bone vectors, already in ``rest.offsets``; None without.
     """
 
     vertices: Tensor
@@ -32,6 +33,7 @@ class Problem:
     rest: RestMoments
     target: Tensor
     origin: Tensor
+    bone_scale: Tensor | None = None
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
