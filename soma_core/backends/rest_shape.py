@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from soma_core.backends.parameters import batch_parameters
-from soma_core.plugin.errors import Stage
+from soma_core.plugin.errors import PluginError, Stage
 from soma_core.plugin.spec import BackendSpec, Generator, HasLinearBasis, LinearBasis
 from soma_core.rig.mesh import CanonicalMesh
 from soma_core.rig.skeleton import Rig
@@ -50,6 +50,8 @@ class ExactRestShape(torch.nn.Module):
             return self.generator.rest(params)
         with self._isolated("rest"):
             native = self.generator.rest(params)
+            if not isinstance(native, Tensor):
+                raise PluginError(f"rest returned {type(native).__name__}, expected a tensor (batch, n, 3)")
         with self._isolated("wrap"):
             self.transfer.check(tuple(native.shape))
         return native
