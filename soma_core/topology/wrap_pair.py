@@ -22,7 +22,7 @@ __all__ = [
 _LFS = b"version https://git-lfs"
 
 
-def refuse_unreadable(path: Path) -> None:
+def refuse_unreadable(path: Path | str) -> None:
     """Raise AssetError where `path` is missing, closed to us, or a git-LFS pointer."""
     try:
         with open(path, "rb") as stream:
@@ -39,7 +39,7 @@ def refuse_unreadable(path: Path) -> None:
         )
 
 
-def read_obj(path: Path) -> tuple[np.ndarray, np.ndarray]:
+def read_obj(path: Path | str) -> tuple[np.ndarray, np.ndarray]:
     """Vertices (n, 3) float64 and triangles (t, 3) int64 of an OBJ, in the file's order.
 
     Only ``v`` and ``f`` lines are read, so texture seams, normals, groups and materials neither split nor
@@ -49,7 +49,7 @@ def read_obj(path: Path) -> tuple[np.ndarray, np.ndarray]:
         AssetError: missing, a git-LFS pointer, not an OBJ mesh, or not finite.
     """
     refuse_unreadable(path)
-    text = path.read_text(encoding="utf-8", errors="replace").replace("\\\n", " ")
+    text = Path(path).read_text(encoding="utf-8", errors="replace").replace("\\\n", " ")
     points: list[list[float]] = []
     faces: list[tuple[int, int, int]] = []
     for number, line in enumerate(text.splitlines(), 1):
