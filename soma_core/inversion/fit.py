@@ -10,6 +10,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
+from soma_core._inputs import check_bone_scale
 from soma_core.errors import InputError
 from soma_core.inversion._inputs import check_vertices, check_weights, refuse_unit_error
 from soma_core.inversion.comparison import compare, part_of
@@ -104,6 +105,7 @@ class PoseInversion(torch.nn.Module):
         *,
         topology: Topology = "canonical",
         weights: Tensor | None = None,
+        bone_scale: Tensor | None = None,
     ) -> InversionResult:
         """Fit every frame on its own.
 
@@ -114,9 +116,11 @@ class PoseInversion(torch.nn.Module):
             topology: which of the two `vertices` are.
             weights: (v,) or (F, v) weights of canonical vertices; zero leaves a vertex out, NaN or not.
                 Default 1, and 0 in the face interior.
+            bone_scale: (1 or F, J - 1) known factors of the bone vectors, as in ``SomaLayer.pose``.
 
         Raises:
-            InputError: a wrong shape, a negative weight, or vertices in another unit than they should be.
+            InputError: a wrong shape, a negative weight or bone scale, or vertices in another unit than they
+                should be.
         """
         vertices = self._canonical(vertices, topology)
         count = len(vertices)
@@ -128,13 +132,16 @@ class PoseInversion(torch.nn.Module):
                 fix="Give one identity for the sequence, or one a frame.",
             )
         weights = check_weights(weights, self.default_weights, count)
+        user_joints = self.layer.rig.joint_count - 1
+        bone_scale = check_bone_scale(bone_scale, count, user_joints, self.layer.dtype, self.layer.device)
         shared = identity.batch_size == 1 and len(weights) == 1
         rest = self.prepare(identity, weights) if shared else None
         parts, scales = [], []
         for first in range(0, count, _CHUNK) or (0,):
             chunk = slice(first, first + _CHUNK)
             who, weight = part_of(identity, chunk), weights[chunk] if len(weights) > 1 else weights
-            part, scale = self._fit(vertices[chunk], who, weight, rest or self.prepare(who, weight))
+            bones = bone_scale[chunk] if bone_scale is not None and len(bone_scale) > 1 else bone_scale
+            part, scale = self._fit(vertices[chunk], who, weight, rest, bones)
             parts.append(part)
             scales.append(scale)
         if not bool(torch.cat([part.valid for part in parts]).any()):
@@ -163,14 +170,25 @@ class PoseInversion(torch.nn.Module):
         return make_transfer(layer.spec, layer.mesh, correspondence, dtype=layer.dtype, device=layer.device)
 
     def _fit(
-        self, vertices: Tensor, identity: Identity, weights: Tensor, rest: RestMoments
+        self,
+        vertices: Tensor,
+        identity: Identity,
+        weights: Tensor,
+        rest: RestMoments | None,
+        bone_scale: Tensor | None,
     ) -> tuple[InversionResult, Tensor]:
         """Result and scale of a chunk of frames."""
         vertices, finite = _without_gaps(vertices, weights, self.layer)
-        target, origin = self.moments.target(vertices, rest)
+        offsets = self.layer.animation.bone_vectors(identity, bone_scale)
+        if rest is None:
+            rest, target, origin = self.moments.each(vertices, identity, weights, offsets)
+        else:
+            rest = replace(rest, offsets=offsets)
+            target, origin = self.moments.target(vertices, rest)
         problem = Problem(
-            vertices=vertices, weights=weights, identity=identity, rest=rest, target=target, origin=origin
-        )
+            vertices=vertices, weights=weights, identity=identity, rest=rest, target=target, origin=origin,
+            bone_scale=bone_scale,
+        )  # fmt: skip
         extent, side = cloud_extent(target, rest)
         scale = extent.median(1).values
         upright = (side * rest.own[..., 3, 3]).sum(1) > 0

@@ -32,8 +32,8 @@ class RestMoments:
     """What a fit needs of an identity; batch i is 1, shared by all frames, or one a frame.
 
     Attributes:
-        local: rest point of every influence about its joint, (i, e, 3) [m].
-        weight: skin weight times vertex weight of every influence, (i, e).
+        local: rest point of every influence about its joint, (i, e, 3) [m]; empty where only sums were made.
+        weight: skin weight times vertex weight of every influence, (i, e); empty likewise.
         own: sums of weight times (local; 1)(local; 1)^T over each joint's influences, (i, T, 4, 4).
         second: ``N`` of every pair of joints that share vertices, (i, p, 4, 4).
         offsets: bone vectors in T-pose world axes, (i, J, 3) [m]; the Hips' entry is not used.
@@ -58,7 +58,7 @@ class SkinMoments(torch.nn.Module):
         structure: index lists of the rig.
         rig: for the T-pose orientation of each joint.
         dtype: of the results.
-        warp: read targets by the Warp twin where one identity serves all frames.
+        warp: sum over vertices by the Warp twins; all but the moments of a shared identity.
     """
 
     def __init__(
@@ -85,6 +85,7 @@ class SkinMoments(torch.nn.Module):
         keep("pair_influences", structure.pair_influences)
         keep("joint_start", _starts(structure.influence_joint, len(structure.joints)))
         keep("pair_start", _starts(structure.pair_entry, len(structure.pairs)))
+        keep("pairs", structure.pairs)
         four = structure.influence_vertex[:, None].repeat(4, 1)
         spans = np.split(four, self.joint_start[1:-1].cpu().numpy())
         keep("moment_col", np.concatenate([span.T.ravel() for span in spans]))
@@ -145,6 +146,45 @@ class SkinMoments(torch.nn.Module):
         frames = [self._one_target(near[f : f + 1], rest, f) for f in range(len(vertices))]
         return torch.cat(frames), origin
 
+    def each(
+        self, vertices: Tensor, identity: Identity, weights: Tensor, offsets: Tensor
+    ) -> tuple[RestMoments, Tensor, Tensor]:
+        """Moments, ``R`` and origin of frames that each have an identity or vertex weights of their own.
+
+        Args:
+            vertices: targets (F, v, 3) [m].
+            identity: batch of 1 or F.
+            weights: (1 or F, v).
+            offsets: (1 or F, J, 3), as in :class:`RestMoments`.
+        """
+        if not self.warp:
+            rest = self.rest(identity, weights, offsets)
+            return rest, *self.target(vertices, rest)
+        from soma_core.kernels.frame_moments_wp import frame_moments
+
+        first, second = self.pairs.unbind(1)
+        bind = identity.bind_world[:, self.joints].expand(len(vertices), -1, 4, 4)
+        centres = bind[..., :3, 3]
+        turn = self.orient.to(self.dtype) @ bind[..., :3, :3].transpose(-1, -2)
+        weight = self.influence_weight.to(self.dtype)
+        a, b = self.pair_influences.unbind(1)
+        pairs, own, target, origin = frame_moments(
+            (self.joint_start, self.influence_vertex, weight),
+            (self.pair_start, self.influence_vertex[a], weight[a] * weight[b], first),
+            identity.rest, centres, weights, vertices,
+        )  # fmt: skip
+        shift = centres[:, first] - centres[:, second]
+        empty = turn.new_empty(len(vertices), 0)
+        rest = RestMoments(
+            local=empty,
+            weight=empty,
+            own=_turned_moments(own, turn, turn, torch.zeros_like(centres)),
+            second=_turned_moments(pairs, turn[:, first], turn[:, second], shift),
+            offsets=offsets,
+        )
+        target = torch.cat((target[..., :3] @ turn.transpose(-1, -2), target[..., 3:]), -1)
+        return rest, target, origin
+
     def _one_target(self, vertices: Tensor, rest: RestMoments, which: int) -> Tensor:
         """``R`` of frames that share identity number `which`."""
         local, weight = rest.local[which].double(), rest.weight[which].double()
@@ -153,6 +193,18 @@ class SkinMoments(torch.nn.Module):
         product = sparse_product(pattern, vertices.permute(1, 2, 0).flatten(1).contiguous())
         # Rows are (joint, 4), columns (3, frame).
         return product.view(self.joint_count, 4, 3, -1).permute(3, 0, 2, 1).to(self.dtype).contiguous()
+
+
+def _turned_moments(sums: Tensor, left: Tensor, right: Tensor, shift: Tensor) -> Tensor:
+    """``sum s (L d; 1)(R (d + h); 1)^T`` (..., 4, 4) from the ten sums of ``s (d; 1)(d; 1)^T``."""
+    xx, xy, xz, yy, yz, zz, x, y, z, mass = sums.unbind(-1)
+    spread = torch.stack((xx, xy, xz, xy, yy, yz, xz, yz, zz), -1).unflatten(-1, (3, 3))
+    first = torch.stack((x, y, z), -1)
+    other = first + mass[..., None] * shift
+    block = left @ (spread + first[..., :, None] * shift[..., None, :]) @ right.transpose(-1, -2)
+    column = (left @ first[..., None]).squeeze(-1)
+    row = torch.cat(((right @ other[..., None]).squeeze(-1), mass[..., None]), -1)
+    return torch.cat((torch.cat((block, column[..., None]), -1), row[..., None, :]), -2)
 
 
 def _sum_rows(rows: Tensor, starts: Tensor) -> Tensor:

@@ -93,12 +93,13 @@ class InversionReport:
         """The state, to be stored; ``merge`` takes it up again."""
         return dict(self._state)
 
-    def merge(self, later: Mapping[str, np.ndarray]) -> None:
-        """Append the state of a report over the frames that follow."""
+    def merge(self, later: Mapping[str, np.ndarray], *, consecutive: bool = True) -> None:
+        """Append the state of a report over the frames that follow, or over those of another sequence."""
         mine = self._state
         merged = {name: mine[name] + later[name] for name in _SUMMED}
         merged |= {name: np.maximum(mine[name], later[name]) for name in _LARGEST}
-        seam = _changes(np.concatenate([mine["last_shoulders"], later["first_shoulders"]]))
+        pair = [mine["last_shoulders"], later["first_shoulders"]]
+        seam = _changes(np.concatenate(pair) if consecutive else later["first_shoulders"][:0])
         merged["changes"] = merged["changes"] + seam["changes"]
         merged["peaks"] = np.maximum(merged["peaks"], seam["peaks"])
         merged["unusable"] = np.concatenate([mine["unusable"], mine["frames"] + later["unusable"]])

@@ -60,15 +60,30 @@ def lane_types(scalar: str, lanes: int) -> SimpleNamespace:
         return x
 
     @wp.func
-    def most(x: vec):
-        """Largest magnitude."""
-        largest = real(0.0)
+    def magnitude(x: vec):
         for c in range(width):
-            largest = wp.max(largest, wp.abs(x[c]))
-        return largest
+            x[c] = wp.abs(x[c])
+        return x
+
+    @wp.func
+    def choose(mask: vec, x: vec, y: vec):
+        """x where the mask is one, y where it is zero; what is not chosen may be NaN."""
+        for c in range(width):
+            x[c] = wp.where(mask[c] > real(0.5), x[c], y[c])
+        return x
+
+    @wp.func
+    def total(x: vec):
+        """Sum over the lanes."""
+        result = real(0.0)
+        for c in range(width):
+            result += x[c]
+        return result
 
     return SimpleNamespace(
-        most=most,
+        total=total,
+        choose=choose,
+        magnitude=magnitude,
         real=real,
         vec=vec,
         lanes=lanes,

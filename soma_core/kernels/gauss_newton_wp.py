@@ -36,7 +36,7 @@ def _kernel(scalar: str, lanes: int, *, shared: bool):
     @wp.kernel(module=module, enable_backward=False)
     def solve(
         plan: Plan, s: state, iterations: int, start_damping: real, lower: real, higher: real,
-        longest: real, threshold: real, second: constants, offsets: constants, target: frames,
+        longest: real, second: constants, offsets: constants, threshold: frames, target: frames,
         relative: frames, hips: frames, accepted: frames, last_change: frames,
     ):  # fmt: skip
         w = wp.tid()
@@ -56,6 +56,8 @@ def _kernel(scalar: str, lanes: int, *, shared: bool):
             damping = vec(start_damping)
             count = vec(real(0.0))
             energy = vec(real(0.0))
+            # A lane rests once it has converged: what becomes of a frame does not depend on its neighbours.
+            moving = vec(real(1.0))
             for _ in range(iterations):
                 assembly.moments(w, g, plan, second, s.turns, s.places, s.column, s.blocks, s.root)
                 assembly.finish(w, plan, s.blocks)
@@ -80,12 +82,15 @@ def _kernel(scalar: str, lanes: int, *, shared: bool):
                 )
                 change(w, plan, s.trial_turns, s.trial_places, s)
                 tree.times_second(w, g, plan.pairs, second, s.change, s.product)
-                energy = energy_change(w, s)
-                better = types.below(energy, real(0.0))
+                gained = energy_change(w, s)
+                better = wp.cw_mul(moving, types.below(gained, real(0.0)))
                 accept(w, better, s)
                 count += better
+                energy = types.choose(moving, gained, energy)
                 damping = wp.cw_mul(damping, vec(higher) + (lower - higher) * better)
-                if types.most(energy) < threshold:
+                damping = types.smaller(damping, vec(real(MOST_DAMPING)))
+                moving -= wp.cw_mul(moving, types.below(types.magnitude(gained) - threshold[g, 0], real(0.0)))
+                if types.total(moving) == real(0.0):
                     break
             for i in range(relative.shape[1]):
                 relative[g, i] = s.relative[w, i]
@@ -199,20 +204,20 @@ def _energy_change(types, state):
 
 
 def _accept(types, state):
-    vec = types.vec
+    vec, choose = types.vec, types.choose
 
     @wp.func
     def accept(w: int, better: vec, s: state):
         """Take the trial in the lanes where `better` is one; keep the state where it is zero."""
         for i in range(s.change.shape[1]):
-            s.residual[w, i] += wp.cw_mul(better, s.product[w, i])
+            s.residual[w, i] = choose(better, s.residual[w, i] + s.product[w, i], s.residual[w, i])
         for i in range(s.relative.shape[1]):
-            s.relative[w, i] += wp.cw_mul(better, s.trial_relative[w, i] - s.relative[w, i])
-            s.turns[w, i] += wp.cw_mul(better, s.trial_turns[w, i] - s.turns[w, i])
+            s.relative[w, i] = choose(better, s.trial_relative[w, i], s.relative[w, i])
+            s.turns[w, i] = choose(better, s.trial_turns[w, i], s.turns[w, i])
         for i in range(s.places.shape[1]):
-            s.places[w, i] += wp.cw_mul(better, s.trial_places[w, i] - s.places[w, i])
+            s.places[w, i] = choose(better, s.trial_places[w, i], s.places[w, i])
         for r in range(3):
-            s.hips[w, r] += wp.cw_mul(better, s.trial_hips[w, r] - s.hips[w, r])
+            s.hips[w, r] = choose(better, s.trial_hips[w, r], s.hips[w, r])
 
     return accept
 
@@ -253,7 +258,7 @@ class GaussNewtonPlan:
 
 def gauss_newton(
     plan: GaussNewtonPlan, target: Tensor, second: Tensor, offsets: Tensor, relative: Tensor, hips: Tensor,
-    *, iterations: int, damping: tuple[float, float, float], longest: float, threshold: float,
+    threshold: Tensor, *, iterations: int, damping: tuple[float, float, float], longest: float,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:  # fmt: skip
     """Refined rotations (F, J, 3, 3), Hips (F, 3) [m], accepted steps (F,), last energy change (F,) [m^2].
 
@@ -263,8 +268,8 @@ def gauss_newton(
         second: ``N`` (1 or F, p, 4, 4).
         offsets: (1 or F, J, 3) [m].
         relative, hips: where to begin.
+        threshold: (F,) a frame is done when a step changes its energy by less [m^2].
         iterations, damping (start, lower, raise), longest [rad]: as in the torch twin.
-        threshold: a group of frames is done when a step changes none of their energies by more [m^2].
     """
     count, scalar, lanes = len(target), scalar_name(target.dtype), lane_count(target)
     shared = len(second) == 1 and len(offsets) == 1
