@@ -51,7 +51,8 @@ class ExactRestShape(torch.nn.Module):
         with self._isolated("rest"):
             native = self.generator.rest(params)
             if not isinstance(native, Tensor):
-                raise PluginError(f"rest returned {type(native).__name__}, expected a tensor (batch, n, 3)")
+                cause = f"rest returned {type(native).__name__}, expected a tensor (batch, n, 3)"
+                raise PluginError(cause, fix="Return the vertices")
         with self._isolated("wrap"):
             self.transfer.check(tuple(native.shape))
         return native
