@@ -115,6 +115,11 @@ class Kinematics(torch.nn.Module):
             offsets: (B or 1, J, 3) from :meth:`local_offsets`.
             translation: (B, 3) Hips position [m]; replaces its offset.
         """
+        turns, positions = self.walk(relative, offsets, translation)
+        return turns @ self.orient, positions
+
+    def walk(self, relative: Tensor, offsets: Tensor, translation: Tensor) -> tuple[Tensor, Tensor]:
+        """As :meth:`forward`, but turns from the T-pose (B, J, 3, 3) in place of world rotations."""
         batch = len(relative)
         eye = torch.eye(3, dtype=relative.dtype, device=relative.device).expand(batch, 1, 3, 3)
         root, limbs = torch.zeros_like(translation)[:, None], offsets[:, 2:].expand(batch, -1, 3)
@@ -123,10 +128,8 @@ class Kinematics(torch.nn.Module):
         if self.warp:
             from soma_core.kernels.kinematics_wp import forward_kinematics
 
-            turns, positions = forward_kinematics(turns, offsets, self.order, self.tree)
-        else:
-            turns, positions = self._walk(turns, offsets)
-        return turns @ self.orient, positions
+            return forward_kinematics(turns, offsets, self.order, self.tree)
+        return self._walk(turns, offsets)
 
     def bind_positions(self, offsets: Tensor, hips: Tensor) -> Tensor:
         """Joint positions (B, J, 3) [m] in the bind pose: the turns are constants, so a sum down the tree.
