@@ -187,11 +187,12 @@ class TrainShapeConfig:
 
 @dataclass
 class Experiment:
-    """What an evaluation measures, on which backend, over how many identities."""
+    """What an evaluation measures, on which backend, over how many identities or frames, by which methods."""
 
     name: str = MISSING
     backend: str = MISSING
     count: int = 100
+    methods: list[str] = field(default_factory=list)
 
 
 @dataclass

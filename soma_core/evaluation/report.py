@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-__all__ = ["Figure", "Report", "distance_figures"]
+__all__ = ["Figure", "Report", "Table", "distance_figures"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -34,6 +34,36 @@ class Figure:
 
 
 @dataclass(frozen=True, kw_only=True)
+class Table:
+    """Rows laid out as in the paper.
+
+    Attributes:
+        title: what the rows have in common.
+        columns: heading of each column; the first one is that of the names of the rows.
+        rows: a name, then numbers or None.
+    """
+
+    title: str
+    columns: Sequence[str]
+    rows: Sequence[Sequence[str | float | None]]
+
+    def as_markdown(self) -> str:
+        """The table, numbers to four digits."""
+        lines = [f"**{self.title}**", "", _row(self.columns), _row(["---"] * len(self.columns))]
+        return "\n".join([*lines, *map(_row, self.rows)])
+
+
+def _row(cells: Sequence[str | float | None]) -> str:
+    return f"| {' | '.join(map(_cell, cells))} |"
+
+
+def _cell(value: str | float | None) -> str:
+    if value is None or isinstance(value, str):
+        return value or ""
+    return f"{value:,.0f}" if abs(value) >= 1000 else f"{value:.4g}"
+
+
+@dataclass(frozen=True, kw_only=True)
 class Report:
     """All figures of one experiment.
 
@@ -41,11 +71,13 @@ class Report:
         title: one line.
         figures: in the order a reader wants them.
         notes: sentences that explain the figures.
+        tables: what is compared but not held to a bound; shown before the figures.
     """
 
     title: str
     figures: Sequence[Figure]
     notes: Sequence[str] = field(default_factory=tuple)
+    tables: Sequence[Table] = field(default_factory=tuple)
 
     @property
     def failed(self) -> list[Figure]:
@@ -58,11 +90,18 @@ class Report:
             {"name": f.name, "value": float(f.value), "unit": f.unit, "bound": f.bound, "passed": f.passed}
             for f in self.figures
         ]
-        return {"title": self.title, "figures": rows, "notes": list(self.notes)}
+        tables = [
+            {"title": t.title, "columns": list(t.columns), "rows": [list(row) for row in t.rows]}
+            for t in self.tables
+        ]
+        return {"title": self.title, "figures": rows, "notes": list(self.notes), "tables": tables}
 
     def as_markdown(self) -> str:
-        """A table, bounds beside figures."""
-        lines = [f"# {self.title}", "", "| figure | value | bound | |", "|---|---|---|---|"]
+        """The tables, then the figures with their bounds beside them."""
+        lines = [f"# {self.title}", ""]
+        for table in self.tables:
+            lines += [table.as_markdown(), ""]
+        lines += ["| figure | value | bound | |", "|---|---|---|---|"]
         for figure in self.figures:
             bound = "" if figure.bound is None else f"<= {figure.bound:g} {figure.unit}"
             mark = "" if figure.bound is None else ("ok" if figure.passed else "FAILED")

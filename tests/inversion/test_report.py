@@ -132,6 +132,22 @@ def test_stored_states_merge_in_the_order_of_the_frames(canonical, result):
     assert joined.as_dict()["frames"] == FRAMES
 
 
+def test_sequences_join_without_a_change_between_them(canonical, result):
+    parts = []
+    for frames in (slice(0, 3), slice(8, FRAMES)):
+        report = InversionReport(*canonical)
+        report.add(part(result, frames))
+        parts.append(report.arrays())
+    joined = InversionReport(*canonical)
+    for arrays in parts:
+        joined.merge(arrays, consecutive=False)
+    errors = 1e3 * result.vertex_error.double().numpy()[:, shoulder_region(canonical[1])]
+    change = np.nanmean(np.abs(np.diff(errors, axis=0))[[0, 1, 8, 9, 10]], axis=1)
+    found = joined.as_dict()["shoulder_change_mm_per_frame"]
+    assert found["mean"] == pytest.approx(change.mean(), rel=1e-6)
+    assert found["peak"] == pytest.approx(change.max(), rel=1e-6)
+
+
 def test_nothing_usable_gives_no_figures(canonical, result):
     found = InversionReport(*canonical)
     found.add(part(result, slice(4, 5)))

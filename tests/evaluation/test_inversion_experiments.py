@@ -1,0 +1,140 @@
+"""The experiments on pose inversion: meshes that move smoothly, tables like the paper's, bounds that bite."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from omegaconf import OmegaConf
+
+from soma_core.errors import InputError
+from soma_core.evaluation import inversion_sequences, table2_inversion, table3_regions
+from soma_core.evaluation.inversion_runs import joint_angle_errors, run_methods
+from soma_core.evaluation.inversion_sequences import MovingMesh
+from soma_core.evaluation.random_poses import joint_spread, smooth_axis_angles
+from soma_core.geometry.rotations import axis_angle_to_matrix
+from soma_core.inversion import InversionResult
+from soma_core.layer import SomaLayer
+
+ANGLE_TOLERANCE = 1e-3
+"""Degrees; float32 matrices resolve about a twentieth of that."""
+
+FRAMES = 3
+
+
+def configured(**changes):
+    experiment = {"name": "x", "backend": "anny", "count": FRAMES, "methods": ["gauss_newton"]} | changes
+    return OmegaConf.create({"experiment": experiment, "seed": 0, "device": "cpu"})
+
+
+@pytest.fixture(scope="module")
+def layer():
+    return SomaLayer("soma")
+
+
+@pytest.fixture(scope="module")
+def mesh(layer):
+    """Three frames of the native body."""
+    turns = smooth_axis_angles(joint_spread(layer.joint_names), FRAMES, np.random.default_rng(0))
+    rotations = axis_angle_to_matrix(torch.as_tensor(turns)).float()
+    with torch.no_grad():
+        vertices = layer.pose(layer.identity({}), rotations).vertices
+    return MovingMesh(name="made here", backend="soma", vertices=vertices, rotations=rotations)
+
+
+@pytest.fixture
+def small(mesh, monkeypatch):
+    """Both experiments on that mesh alone, so that they take seconds."""
+    for module in (table2_inversion, table3_regions):
+        for maker in ("own_meshes", "anny_meshes"):
+            if hasattr(module, maker):
+                monkeypatch.setattr(module, maker, lambda count, seed: iter([mesh]))
+
+
+def test_smooth_motions_are_smooth_and_end_where_they_begin():
+    spread = np.array([0.5, 0.0, 0.2])
+    turns = smooth_axis_angles(spread, 100, np.random.default_rng(0))
+    assert turns.shape == (100, 3, 3)
+    assert not turns[:, 1].any()
+    steps = np.linalg.norm(np.diff(turns, axis=0, append=turns[:1]), axis=-1)
+    assert steps.max() < 0.15  # rad a frame; a jump at the seam would be about as long as the spread
+    assert steps[-1].max() < 0.15
+    assert np.linalg.norm(turns, axis=-1).max() <= 1.6 + 1e-12
+    again = smooth_axis_angles(spread, 100, np.random.default_rng(0))
+    np.testing.assert_array_equal(turns, again)
+
+
+def test_table2_lays_the_papers_rows_beside_ours(small):
+    report = table2_inversion.run(configured())
+    assert not report.failed
+    assert len(report.figures) == 6
+    text = report.as_markdown()
+    assert "| skeleton transfer only | 16.5 | 13.9 |  | 80.1 | 17,393 |" in text
+    assert text.count("| gauss_newton | ") == 2
+    assert "| made here | " in text
+    assert json.loads(json.dumps(report.as_json()))["tables"][0]["rows"][1][:3] == ["analytical", 5.3, 3.2]
+
+
+def test_table2_fails_where_the_default_misses_its_bound(small, mesh, monkeypatch):
+    noisy = replace(mesh, vertices=mesh.vertices + 0.01 * torch.randn(mesh.vertices.shape))
+    monkeypatch.setattr(table2_inversion, "own_meshes", lambda count, seed: iter([noisy]))
+    failed = {figure.name for figure in table2_inversion.run(configured()).failed}
+    assert {"own meshes, mean", "own meshes, max", "own meshes, mean angle of a joint"} <= failed
+
+
+def test_table3_gives_every_region_of_the_paper(small):
+    report = table3_regions.run(configured())
+    assert [figure.name for figure in report.figures] == ["shoulders, peak change"]
+    text = report.as_markdown()
+    assert "| method | all, mm | body, mm | hands, mm | feet, mm | head, mm |" in text
+    assert "| the paper, Newton-Schulz |  | 0.8 |" in text
+
+
+def test_methods_are_those_of_the_command_line(mesh):
+    with pytest.raises(InputError, match=r"experiment\.methods: got 'guess', expected among .*gauss_newton"):
+        run_methods([mesh], ["guess"], device="cpu")
+
+
+def test_the_angle_is_that_between_the_rotations(layer, mesh):
+    names = list(layer.joint_names)
+    turned = mesh.rotations.clone()
+    turned[:, names.index("LeftForeArm")] @= axis_angle_to_matrix(
+        torch.tensor([0.0, np.radians(5), 0]).float()
+    )
+    turned[:, names.index("HeadEnd")] = torch.eye(3)  # carries no skin and does not count
+    fields = dict.fromkeys(InversionResult.__dataclass_fields__, torch.zeros(0))
+    angles = joint_angle_errors(mesh, InversionResult(**fields | {"rotations": turned}), layer)
+    assert angles.max() == pytest.approx(5, abs=ANGLE_TOLERANCE)
+    assert (angles > 1).sum() == FRAMES
+    assert 50 < len(angles) / FRAMES < 77
+    foreign = replace(mesh, rotations=None)
+    assert not len(joint_angle_errors(foreign, InversionResult(**fields | {"rotations": turned}), layer))
+
+
+def test_own_meshes_cover_both_backends_and_the_clip():
+    pytest.importorskip("soma_backend_anny")
+    found = list(inversion_sequences.own_meshes(2, 0))
+    assert [mesh.backend for mesh in found[:3]] == ["anny", "soma", "anny"]
+    assert "range of motion" in found[2].name
+    assert all(mesh.vertices.shape == (2, 18056, 3) for mesh in found)
+    assert all(mesh.rotations.shape == (2, 77, 3, 3) for mesh in found)
+
+
+@pytest.mark.slow
+def test_annys_own_rig_gives_bodies_that_the_fit_explains():
+    pytest.importorskip("anny")
+    pytest.importorskip("soma_backend_anny")
+    meshes = list(inversion_sequences.anny_meshes(FRAMES, 0))
+    assert [mesh.topology for mesh in meshes] == ["native", "native"]
+    runs, each = run_methods(meshes, ["gauss_newton"], device="cpu")
+    assert runs["gauss_newton"].summary["error_mm"]["all"]["mean"] < 6
+    assert len(each) == 2
+
+
+def test_a_missing_anny_package_is_named(monkeypatch):
+    monkeypatch.setitem(__import__("sys").modules, "anny", None)
+    with pytest.raises(
+        InputError, match=r"got no anny package, expected the anny package\. pip install anny"
+    ):
+        inversion_sequences.anny_native_vertices({}, 2, np.random.default_rng(0))
