@@ -24,8 +24,8 @@ from soma_core.inversion.structure import MomentStructure
 __all__ = ["GaussNewton"]
 
 _START_DAMPING = 1e-3
-_LOWER, _RAISE = 0.2, 8.0
-"""Levenberg damping, relative to the diagonal: its start, and its factors after a good and a bad step."""
+_LOWER, _RAISE, _MOST_DAMPING = 0.2, 8.0, 1e6
+"""Levenberg damping, relative to the diagonal: start, factors after a good and a bad step, largest value."""
 
 _RIDGE = 1e-9
 """Relative to the mean diagonal: keeps the factorisation defined where a joint moves nothing."""
@@ -82,10 +82,10 @@ class GaussNewton(torch.nn.Module):
             rest: moments of one identity or of one a frame.
             start: poses to begin from.
             iterations: number of steps tried; a step that would raise the energy is undone and damped.
-            tolerance: the Warp twin leaves a group of frames when a step changes their energies by less,
-                as a root mean square [m]; the reference takes every step, so that it waits for no device.
+            tolerance: a frame rests once a step changed its energy by less, as a root mean square [m],
+                whatever its neighbours do.
         """
-        if self.plan is not None:
+        if self.plan is not None and iterations:
             return self._by_warp(target, rest, start, iterations, tolerance)
         second = self.dense(rest.second)
         pose = start
@@ -93,6 +93,7 @@ class GaussNewton(torch.nn.Module):
         residual = self.gradient(turns, places, second, target)
         mass = rest.own[..., 3, 3].sum(1)
         damping = torch.full_like(pose.last_change, _START_DAMPING)
+        moving = torch.ones_like(pose.last_change, dtype=torch.bool)
         for _ in range(iterations):
             matrix, slope = self.normal_equations(turns, places, rest.second, residual)
             step = self._solve(matrix, slope, damping)
@@ -101,18 +102,19 @@ class GaussNewton(torch.nn.Module):
             change = torch.cat((trial_turns - turns, (trial_places - places)[..., None]), -1)[:, self.joints]
             product = self.times_second(change, second)
             energy = (change * (product + 2 * residual)).sum((1, 2, 3))
-            better = energy < 0
+            better = moving & (energy < 0)
             keep = better[:, None, None, None]
             pose = Pose(
                 relative=torch.where(keep, trial.relative, pose.relative),
                 translation=torch.where(better[:, None], trial.translation, pose.translation),
                 accepted=pose.accepted + better,
-                last_change=(energy.abs() / mass).sqrt(),
+                last_change=torch.where(moving, (energy.abs() / mass).sqrt(), pose.last_change),
             )
+            moving = moving & ~(pose.last_change < tolerance)
             turns = torch.where(keep, trial_turns, turns)
             places = torch.where(keep[..., 0], trial_places, places)
             residual = torch.where(keep, residual + product, residual)
-            damping = damping * torch.where(better, _LOWER, _RAISE).to(damping)
+            damping = (damping * torch.where(better, _LOWER, _RAISE).to(damping)).clamp_max(_MOST_DAMPING)
         return pose
 
     def _by_warp(
@@ -123,8 +125,8 @@ class GaussNewton(torch.nn.Module):
         mass = rest.own[..., 3, 3].sum(1)
         relative, translation, accepted, energy = gauss_newton(
             self.plan, target, rest.second, rest.offsets, start.relative, start.translation,
-            iterations=iterations, damping=(_START_DAMPING, _LOWER, _RAISE), longest=_LONGEST_STEP,
-            threshold=tolerance**2 * float(mass.min()),
+            (tolerance**2 * mass).expand(len(target)), iterations=iterations,
+            damping=(_START_DAMPING, _LOWER, _RAISE, _MOST_DAMPING), longest=_LONGEST_STEP,
         )  # fmt: skip
         return Pose(
             relative=relative,

@@ -60,6 +60,12 @@ def lane_types(scalar: str, lanes: int) -> SimpleNamespace:
         return x
 
     @wp.func
+    def smaller(x: vec, y: vec):
+        for c in range(width):
+            x[c] = wp.min(x[c], y[c])
+        return x
+
+    @wp.func
     def magnitude(x: vec):
         for c in range(width):
             x[c] = wp.abs(x[c])
@@ -67,7 +73,7 @@ def lane_types(scalar: str, lanes: int) -> SimpleNamespace:
 
     @wp.func
     def choose(mask: vec, x: vec, y: vec):
-        """x where the mask is one, y where it is zero; what is not chosen may be NaN."""
+        """Take x where the mask is one, y where it is zero; what is not taken may be NaN."""
         for c in range(width):
             x[c] = wp.where(mask[c] > real(0.5), x[c], y[c])
         return x
@@ -91,6 +97,7 @@ def lane_types(scalar: str, lanes: int) -> SimpleNamespace:
         inverse_root=inverse_root,
         below=below,
         larger=larger,
+        smaller=smaller,
     )  # fmt: skip
 
 

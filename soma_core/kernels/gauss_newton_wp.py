@@ -36,7 +36,7 @@ def _kernel(scalar: str, lanes: int, *, shared: bool):
     @wp.kernel(module=module, enable_backward=False)
     def solve(
         plan: Plan, s: state, iterations: int, start_damping: real, lower: real, higher: real,
-        longest: real, second: constants, offsets: constants, threshold: frames, target: frames,
+        most: real, longest: real, second: constants, offsets: constants, threshold: frames, target: frames,
         relative: frames, hips: frames, accepted: frames, last_change: frames,
     ):  # fmt: skip
         w = wp.tid()
@@ -88,7 +88,7 @@ def _kernel(scalar: str, lanes: int, *, shared: bool):
                 count += better
                 energy = types.choose(moving, gained, energy)
                 damping = wp.cw_mul(damping, vec(higher) + (lower - higher) * better)
-                damping = types.smaller(damping, vec(real(MOST_DAMPING)))
+                damping = types.smaller(damping, vec(most))
                 moving -= wp.cw_mul(moving, types.below(types.magnitude(gained) - threshold[g, 0], real(0.0)))
                 if types.total(moving) == real(0.0):
                     break
@@ -258,7 +258,7 @@ class GaussNewtonPlan:
 
 def gauss_newton(
     plan: GaussNewtonPlan, target: Tensor, second: Tensor, offsets: Tensor, relative: Tensor, hips: Tensor,
-    threshold: Tensor, *, iterations: int, damping: tuple[float, float, float], longest: float,
+    threshold: Tensor, *, iterations: int, damping: tuple[float, float, float, float], longest: float,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:  # fmt: skip
     """Refined rotations (F, J, 3, 3), Hips (F, 3) [m], accepted steps (F,), last energy change (F,) [m^2].
 
@@ -269,12 +269,12 @@ def gauss_newton(
         offsets: (1 or F, J, 3) [m].
         relative, hips: where to begin.
         threshold: (F,) a frame is done when a step changes its energy by less [m^2].
-        iterations, damping (start, lower, raise), longest [rad]: as in the torch twin.
+        iterations, damping (start, lower, raise, most), longest [rad]: as in the torch twin.
     """
     count, scalar, lanes = len(target), scalar_name(target.dtype), lane_count(target)
     shared = len(second) == 1 and len(offsets) == 1
     types = lane_types(scalar, lanes)
-    groups = to_lanes(target, lanes), to_lanes(relative, lanes), to_lanes(hips, lanes)
+    groups = [to_lanes(one, lanes) for one in (threshold[:, None], target, relative, hips)]
     if shared:
         constants = second.reshape(1, -1).contiguous(), offsets.reshape(1, -1).contiguous()
     else:
@@ -291,7 +291,7 @@ def gauss_newton(
         with launching(target) as device:
             wp.launch(
                 kernel, dim=workers,
-                inputs=[plan.plan, state, iterations, *damping, longest, threshold, *numbers,
+                inputs=[plan.plan, state, iterations, *damping, longest, *numbers,
                         *(as_lanes(one[part], types) for one in (*groups, *outputs))],
                 device=device,
             )  # fmt: skip
@@ -300,5 +300,5 @@ def gauss_newton(
     in_threads(run, len(groups[0]), target)
     accepted, last = (from_lanes(one, count, ()) for one in outputs)
     return (
-        from_lanes(groups[1], count, relative.shape[1:]), from_lanes(groups[2], count, (3,)), accepted, last
+        from_lanes(groups[2], count, relative.shape[1:]), from_lanes(groups[3], count, (3,)), accepted, last
     )  # fmt: skip
