@@ -1,15 +1,16 @@
 """Hierarchical inverse skinning: Procrustes of one tree level after the other (paper, section 3.6).
 
-With all other joints fixed, turning the whole subtree of joint j about its centre by Q moves its share
-``q_vj = sum_(t in subtree) w_vt (y_vt - c_j)`` of every vertex to ``Q q_vj``. The best Q is the rotation nearest to
-``sum_v o_v (q_vj - r_v) q_vj^T = S_j - Y_j^T``, r_v the residual: what the paper computes by subtracting the
-ancestors' part from the posed vertices. Both terms follow from the moments, so no vertex is touched, and the
-weights are exact: no vertex is assigned to one subtree.
+With all other joints fixed, turning the whole subtree of joint j about its centre c_j by Q moves its share
+``q_vj = sum_(t in subtree) w_vt (y_vt - c_j)`` of every vertex to ``Q q_vj``. The best Q is the rotation
+nearest to ``sum_v o_v (q_vj - r_v) q_vj^T = S_j - Y_j^T``, r_v the residual: what the paper computes by
+subtracting the ancestors' part from the posed vertices. Both terms follow from the moments, so that no vertex
+is touched, and none has to be assigned to one subtree.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import re
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -23,8 +24,12 @@ from soma_core.inversion.gauss_newton import GaussNewton
 from soma_core.inversion.moments import RestMoments
 from soma_core.inversion.problem import Pose
 from soma_core.inversion.structure import MomentStructure
+from soma_core.rig.skeleton import Rig
 
 __all__ = ["Analytical", "AnalyticalOptions", "Level", "sweep_levels"]
+
+_FINGERS = r"(Left|Right)Hand\w+"
+"""Joints below the hands."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -49,7 +54,10 @@ class AnalyticalOptions:
             count = getattr(self, name)
             if count < 0:
                 raise InputError(
-                    f"analytical.{name}", got=count, expected="at least 0", fix=f"Pass {name}=1, or 0 for none."
+                    f"analytical.{name}",
+                    got=count,
+                    expected="at least 0",
+                    fix=f"Pass {name}=1, or 0 for none.",
                 )
 
 
@@ -96,36 +104,33 @@ class Analytical(torch.nn.Module):
 
     Args:
         structure: which joints share vertices.
+        rig: for the names of the fingers' joints.
         solver: keeps the tree and multiplies by the moments.
-        fingers: ids of the joints of the fingers.
+        options: number of sweeps.
     """
 
     def __init__(
-        self,
-        structure: MomentStructure,
-        solver: GaussNewton,
-        *,
-        fingers: Sequence[int],
-        device: torch.device | str,
+        self, structure: MomentStructure, rig: Rig, solver: GaussNewton, *, options: AnalyticalOptions
     ) -> None:
         super().__init__()
-        self.solver = solver
+        self.solver, self.options = solver, options
+        device = solver.joints.device
+        fingers = [joint for joint, name in enumerate(rig.joint_names) if re.fullmatch(_FINGERS, name)]
         self.body = sweep_levels(structure, np.setdiff1d(structure.variables, fingers), device=device)
-        self.fingers = sweep_levels(structure, np.asarray(fingers, np.int64), device=device)
+        self.fingers = sweep_levels(structure, np.array(fingers, np.int64), device=device)
         self.full = sweep_levels(structure, structure.variables, device=device)
         meeting = torch.as_tensor(_meeting_joints(structure), device=device)
         self.register_buffer("meeting", meeting, persistent=False)
 
-    def forward(self, target: Tensor, rest: RestMoments, start: Pose, options: AnalyticalOptions) -> Pose:
+    def forward(self, target: Tensor, rest: RestMoments, start: Pose) -> Pose:
         """Refine `start`; never worse than it.
 
         Args:
             target: ``R`` (F, T, 3, 4) of the targets.
             rest: moments of one identity or of one a frame.
             start: poses to begin from.
-            options: number of sweeps.
         """
-        second = self.solver.dense(rest.second)
+        options, second = self.options, self.solver.dense(rest.second)
         schedule = [self.body] * options.body + [self.fingers] * options.fingers + [self.full] * options.full
         pose = start
         for levels in schedule:
@@ -135,7 +140,7 @@ class Analytical(torch.nn.Module):
     def sweep(
         self,
         pose: Pose,
-        levels: Sequence[Level],
+        levels: Iterable[Level],
         target: Tensor,
         rest: RestMoments,
         second: Tensor,

@@ -1,17 +1,22 @@
-"""Gradient descent through the forward model: Adam on 6D rotations (paper, section 3.6; Zhou et al., 2019)."""
+"""Gradient descent through the forward model: Adam on rotations in 6D (paper, section 3.6).
+
+The 6D parametrisation is that of Zhou et al., "On the continuity of rotation representations", CVPR 2019.
+"""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, field, replace
-from typing import Literal
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, fields, is_dataclass, replace
+from typing import Any, Literal
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from soma_core.animation.engine import Animation
 from soma_core.errors import InputError
+from soma_core.inversion.comparison import part_of
 from soma_core.inversion.gauss_newton import GaussNewton
 from soma_core.inversion.problem import Pose, Problem
 
@@ -19,6 +24,9 @@ __all__ = ["Autograd", "AutogradOptions", "from_six", "to_six"]
 
 _POSED_AT_A_TIME = 64
 """Frames that pass through skinning together, which bounds memory; frames do not influence each other."""
+
+_Loss = Callable[[Tensor, Tensor], Tensor]
+"""(F,) from rotations (F, J, 3, 3) and translations (F, 3)."""
 
 _MM2 = 1e6
 """Square metres to square millimetres: keeps gradients far above Adam's epsilon."""
@@ -69,7 +77,10 @@ class AutogradOptions:
                 )
         if self.loss not in ("moments", "vertices"):
             raise InputError(
-                "autograd.loss", got=repr(self.loss), expected="'moments' or 'vertices'", fix="Correct the name."
+                "autograd.loss",
+                got=repr(self.loss),
+                expected="'moments' or 'vertices'",
+                fix="Correct the name.",
             )
         if self.penalty is not None and self.loss != "vertices":
             raise InputError(
@@ -78,6 +89,11 @@ class AutogradOptions:
                 expected="none: moments know only the squared distance",
                 fix="Pass loss='vertices'.",
             )
+
+    def decay(self, step: int) -> float:
+        """Learning rate of a step, relative to the first."""
+        done = step / max(self.iterations - 1, 1)
+        return self.final + (1 - self.final) * 0.5 * (1 + math.cos(math.pi * min(done, 1)))
 
 
 def to_six(rotation: Tensor) -> Tensor:
@@ -99,26 +115,135 @@ class Autograd(torch.nn.Module):
 
     Args:
         solver: keeps the tree and multiplies by the moments.
-        animation: the forward model, for ``loss="vertices"``.
+        animation: the forward model.
+        regions: vertex ids of each region that `options` may weigh.
+        options: steps, rates and loss.
+
+    Raises:
+        InputError: a region that the mesh does not have.
     """
 
-    def __init__(self, solver: GaussNewton, animation: Animation) -> None:
+    def __init__(
+        self,
+        solver: GaussNewton,
+        animation: Animation,
+        *,
+        regions: Mapping[str, np.ndarray],
+        options: AutogradOptions,
+    ) -> None:
         super().__init__()
-        self.solver, self.animation = solver, animation
+        self.solver, self.animation, self.options = solver, animation, options
+        for name in options.regions:
+            if name not in regions:
+                raise InputError(
+                    "autograd.regions",
+                    got=repr(name),
+                    expected=f"among {', '.join(regions)}",
+                    fix="Correct it.",
+                )
+        self.regions = {name: torch.as_tensor(regions[name]) for name in options.regions}
 
-    def forward(self, problem: Problem, start: Pose, options: AutogradOptions) -> Pose:
-        """Refine `start`; never worse than it in the loss of `options`.
+    def weighted(self, weights: Tensor) -> Tensor:
+        """Vertex weights (..., v) times the factors of their regions."""
+        weights = weights.clone()
+        for name, ids in self.regions.items():
+            weights[..., ids.to(weights.device)] *= self.options.regions[name]
+        return weights
+
+    def forward(self, problem: Problem, start: Pose) -> Pose:
+        """Refine `start`; never worse than it in the loss of the options.
+
+        Works under ``no_grad`` and ``inference_mode``; nothing is differentiable in the result.
 
         Args:
-            problem: the frames; its weights are final, regions included.
+            problem: the frames; its weights and moments are those of :meth:`weighted`.
             start: poses to begin from.
-            options: steps, rates and loss.
         """
-        if options.loss == "moments":
-            return self._descend(start, options, *self._moments(problem, start))
-        parts = []
-        for first in range(0, len(start.relative), _POSED_AT_A_TIME):
-            chunk = slice(first, first + _POSED_AT_A_TIME)
-            part = Pose(**{name: value[chunk] for name, value in vars(start).items()})
-            parts.append(self._descend(part, options, *self._vertices(problem.part(chunk), options)))
-        return Pose(**{name: torch.cat([getattr(part, name) for part in parts]) for name in vars(start)})
+        with torch.inference_mode(mode=False), torch.enable_grad():
+            problem, start = _usable(problem), _usable(start)
+            if self.options.loss == "moments":
+                return self._descend(start, self._by_moments(problem, start))
+            parts = []
+            for first in range(0, len(start.relative), _POSED_AT_A_TIME):
+                chunk = slice(first, first + _POSED_AT_A_TIME)
+                part = Pose(**{name: value[chunk] for name, value in vars(start).items()})
+                parts.append(self._descend(part, self._by_vertices(problem, chunk)))
+            return Pose(**{name: torch.cat([getattr(part, name) for part in parts]) for name in vars(start)})
+
+    def _by_moments(self, problem: Problem, start: Pose) -> _Loss:
+        """Mean squared distance [m^2] beyond that of the start, exact for any step."""
+        solver, rest, joints = self.solver, problem.rest, self.solver.joints
+        second, mass = solver.dense(rest.second), rest.own[..., 3, 3].sum(1)
+        turns, places = solver.walk(start, rest.offsets)
+        residual = solver.gradient(turns, places, second, problem.target)
+
+        def loss(relative: Tensor, shift: Tensor) -> Tensor:
+            turned, placed = self.animation.kinematics.walk(relative[:, 1:], rest.offsets, shift)
+            change = torch.cat((turned - turns, (placed - places)[..., None]), -1)[:, joints]
+            product = solver.times_second(change, second)
+            return (change * (product + 2 * residual)).sum((1, 2, 3)) / mass
+
+        return loss
+
+    def _by_vertices(self, problem: Problem, chunk: slice) -> _Loss:
+        """Weighted mean of the penalised squared distances [m^2] under the forward model."""
+        penalty, identity = self.options.penalty, part_of(problem.identity, chunk)
+        target = problem.vertices[chunk] - problem.origin[chunk, None]
+        weights, scale = (
+            value[chunk] if value is not None and len(value) > 1 else value
+            for value in (problem.weights, problem.bone_scale)
+        )
+        total = weights.sum(1).clamp_min(torch.finfo(weights.dtype).tiny)
+
+        def loss(relative: Tensor, shift: Tensor) -> Tensor:
+            posed = self.animation.pose(identity, relative[:, 1:], shift, absolute=False, bone_scale=scale)
+            squared = (posed.vertices - target).square().sum(-1)
+            return (weights * (squared if penalty is None else penalty(squared))).sum(1) / total
+
+        return loss
+
+    def _descend(self, start: Pose, loss: _Loss) -> Pose:
+        """Adam on the first two columns of every variable rotation and on the translation."""
+        options, n = self.options, self.solver.variables
+        six = to_six(start.relative[:, n]).clone().requires_grad_()
+        shift = start.translation.clone().requires_grad_()
+        groups = [{"params": [six], "lr": options.rate}, {"params": [shift], "lr": options.shift_rate}]
+        adam = torch.optim.Adam(groups)
+        fall = torch.optim.lr_scheduler.LambdaLR(adam, options.decay)
+        best = start
+        with torch.no_grad():
+            lowest = last = loss(start.relative, start.translation)
+        for step in range(options.iterations + 1):
+            relative = start.relative.index_copy(1, n, from_six(six))
+            value = loss(relative, shift)
+            best, lowest = _better(best, lowest, relative.detach(), shift.detach(), value.detach())
+            if step == options.iterations:
+                break
+            six.grad, shift.grad = torch.autograd.grad(_MM2 * value.sum(), (six, shift))
+            last = value.detach()
+            adam.step()
+            fall.step()
+        return replace(best, last_change=(value.detach() - last).abs().sqrt())
+
+
+def _better(
+    best: Pose, lowest: Tensor, relative: Tensor, shift: Tensor, value: Tensor
+) -> tuple[Pose, Tensor]:
+    """The better state of each frame."""
+    better = value < lowest
+    pose = replace(
+        best,
+        relative=torch.where(better[:, None, None, None], relative, best.relative),
+        translation=torch.where(better[:, None], shift, best.translation).clone(),
+        accepted=best.accepted + better,
+    )
+    return pose, torch.where(better, value, lowest)
+
+
+def _usable(value: Any) -> Any:
+    """The same value, of tensors that autograd may save: those made in inference mode are copied."""
+    if isinstance(value, Tensor):
+        return value.clone() if value.is_inference() else value
+    if not is_dataclass(value):
+        return value
+    return replace(value, **{one.name: _usable(getattr(value, one.name)) for one in fields(value)})

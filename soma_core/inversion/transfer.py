@@ -1,4 +1,4 @@
-"""Skeleton transfer: the skeleton fit of a posed mesh as a start, or as a coarse fast fit (paper, section 3.6)."""
+"""Skeleton transfer: the skeleton fit of a posed mesh, a coarse fast fit (paper, section 3.6)."""
 
 from __future__ import annotations
 
