@@ -177,7 +177,7 @@ def _message(node: ast.AST, function: ast.FunctionDef, names: dict[str, ast.expr
             ("_problem", "_spoken")
         ):
             return _text(getattr(node.value, "body", node.value), names)
-        case ast.Call(func=ast.Name(id="PluginError"), args=[text]):
+        case ast.Call(func=ast.Name(id="PluginError" | "_broken_file"), args=[*_, text]):
             return _text(text, names)
         case ast.Call(func=ast.Name(id="InputError"), args=[argument], keywords=keywords):
             got, expected = (_text(word.value, names) for word in keywords[:2])
@@ -207,13 +207,15 @@ def _messages(*modules: str) -> Iterator[str]:
                 continue
             for names in _assignments(function):
                 texts = (re.sub("…+", "…", _message(node, function, names)) for node in ast.walk(function))
-                yield from (text for text in texts if re.search(r"\w", text))
+                yield from (text for text in texts if not _SAYS_NOTHING.fullmatch(text))
 
 
 BACKEND = (
     *(f"plugin/{name}.py" for name in ("declaration", "hooks", "registry", "configs", "options")),
     *(f"topology/{name}.py" for name in ("wrap_pair", "correspondence", "transfer")),
+    "config/refusals.py",
 )
+_SAYS_NOTHING = re.compile(r"(\W|got|expected|configuration|one of)*")
 RAISED_BY_PLUGINS = "…Error: …"
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import colorsys
 import hashlib
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -110,11 +111,12 @@ def gallery(path: Path, bodies: Sequence[Body], *, width: int = 1600, columns: i
         path: the PNG.
         bodies: one an identity.
         width: width of the picture in pixels.
-        columns: bodies in a row.
+        columns: at most so many bodies in a row; rows are filled evenly.
 
     Raises:
         SomaError: pyvista is not installed.
     """
+    columns = math.ceil(len(bodies) / math.ceil(len(bodies) / columns))
     top = max(float(body.vertices[:, 1].max()) for body in bodies) * 1.14
     distance = top / 2 / np.tan(np.radians(VIEW_ANGLE / 2))
     rows = [_line(bodies[start : start + columns], distance) for start in range(0, len(bodies), columns)]
@@ -123,7 +125,7 @@ def gallery(path: Path, bodies: Sequence[Body], *, width: int = 1600, columns: i
     with open_stage((width, int(width * top / span))) as stage:
         for line, centres, _ in rows:
             picture = stage.shot(line, focus=(0, top * 0.45, 0), height=top, flat=True)
-            pictures.append(_captioned(picture, line, (centres / span + 0.5) * width))
+            pictures.append(_captioned(picture, line, (centres / span + 0.5) * width, columns))
     atomic_write(path, lambda target: _stacked(pictures).save(target, "PNG"))
 
 
@@ -187,11 +189,11 @@ def _grid(cells: Sequence[Image], bodies: Sequence[Body], columns: int) -> Image
     return sheet
 
 
-def _captioned(picture: Image, bodies: Sequence[Body], places: np.ndarray) -> Image:
-    """Add a band with one caption below each body."""
+def _captioned(picture: Image, bodies: Sequence[Body], places: np.ndarray, columns: int) -> Image:
+    """Add a band with one caption below each body, in the size for a row of so many."""
     from PIL import Image, ImageDraw
 
-    size, band = _caption_sizes(picture.width // max(len(bodies), 4))
+    size, band = _caption_sizes(picture.width // max(columns, 4))
     lines = max(body.caption.count("\n") + 1 for body in bodies)
     sheet = Image.new("RGB", (picture.width, picture.height + band + (lines - 1) * size), _rgb(PAPER))
     sheet.paste(picture, (0, 0))

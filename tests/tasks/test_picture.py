@@ -83,6 +83,16 @@ def test_gallery_shows_every_body_whole(pyvista, tmp_path):
     assert middles == sorted(middles)
 
 
+def test_gallery_fills_its_rows_evenly(pyvista, tmp_path):
+    above, below = (0.2, 0.8, 0.2), (0.2, 0.3, 0.9)
+    bodies = [box(0.5, 1.7, colour) for colour in (above, above, below, below)]
+    gallery(tmp_path / "gallery.png", bodies, width=400, columns=3)
+    rows = [
+        np.flatnonzero(painted(tmp_path / "gallery.png", colour).any(axis=1)) for colour in (above, below)
+    ]
+    assert rows[0].max() < rows[1].min()
+
+
 def test_missing_pyvista_is_named_with_the_pip_line(monkeypatch, tmp_path):
     monkeypatch.setitem(sys.modules, "pyvista", None)
     with pytest.raises(SomaError, match=r"need pyvista.*pip install 'soma-body-core\[render\]'"):
