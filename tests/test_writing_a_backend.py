@@ -215,7 +215,7 @@ BACKEND = (
     *(f"topology/{name}.py" for name in ("wrap_pair", "correspondence", "transfer")),
     "config/refusals.py",
 )
-_SAYS_NOTHING = re.compile(r"(\W|got|expected|configuration|one of)*")
+_SAYS_NOTHING = re.compile(r"([….,: ]|got|expected|configuration|one of)*")
 RAISED_BY_PLUGINS = "…Error: …"
 
 
