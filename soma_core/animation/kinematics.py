@@ -115,11 +115,6 @@ class Kinematics(torch.nn.Module):
             offsets: (B or 1, J, 3) from :meth:`local_offsets`.
             translation: (B, 3) Hips position [m]; replaces its offset.
         """
-        turns, positions = self.walk(relative, offsets, translation)
-        return turns @ self.orient, positions
-
-    def walk(self, relative: Tensor, offsets: Tensor, translation: Tensor) -> tuple[Tensor, Tensor]:
-        """As :meth:`forward`, but turns from the T-pose (B, J, 3, 3) in place of world rotations."""
         batch = len(relative)
         eye = torch.eye(3, dtype=relative.dtype, device=relative.device).expand(batch, 1, 3, 3)
         root, limbs = torch.zeros_like(translation)[:, None], offsets[:, 2:].expand(batch, -1, 3)
@@ -128,19 +123,26 @@ class Kinematics(torch.nn.Module):
         if self.warp:
             from soma_core.kernels.kinematics_wp import forward_kinematics
 
-            return forward_kinematics(turns, offsets, self.order, self.tree)
-        return self._walk(turns, offsets)
+            turns, positions = forward_kinematics(turns, offsets, self.order, self.tree)
+        else:
+            turns, positions = self._walk(turns, offsets)
+        return turns @ self.orient, positions
 
     def bind_positions(self, offsets: Tensor, hips: Tensor) -> Tensor:
-        """Joint positions (B, J, 3) [m] in the bind pose: the turns are constants, so a sum down the tree.
+        """Joint positions (B, J, 3) [m] in the bind pose, whose turns are constants; see :meth:`positions`."""
+        return self.positions(self.bind_parent_turn, offsets, hips)
+
+    def positions(self, parent_turns: Tensor, offsets: Tensor, hips: Tensor) -> Tensor:
+        """Joint positions (B, J, 3) [m] where the turns are known: a sum down the tree.
 
         Args:
-            offsets: (B, J, 3) from :meth:`local_offsets`.
+            parent_turns: turns from the T-pose of each joint's parent, (J, 3, 3) or (B, J, 3, 3).
+            offsets: (B or 1, J, 3) from :meth:`local_offsets`.
             hips: (B, 3) Hips position [m].
         """
-        root = torch.zeros_like(hips)[:, None]
-        steps = torch.cat((root, hips[:, None], offsets[:, 2:]), 1)
-        return self.ancestors @ (self.bind_parent_turn @ steps[..., None]).squeeze(-1)
+        steps = (parent_turns[..., 2:, :, :] @ offsets[:, 2:, :, None]).squeeze(-1)
+        steps = torch.cat((torch.zeros_like(hips)[:, None], hips[:, None], steps), 1)
+        return self.ancestors @ steps
 
     def _walk(self, relative: Tensor, offsets: Tensor) -> tuple[Tensor, Tensor]:
         """Accumulate turns and positions level by level from the root."""
