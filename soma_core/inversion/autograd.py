@@ -1,6 +1,8 @@
 """Gradient descent through the forward model: Adam on rotations in 6D (paper, section 3.6).
 
-The 6D parametrisation is that of Zhou et al., "On the continuity of rotation representations", CVPR 2019.
+The 6D parametrisation is that of Zhou et al., "On the continuity of rotation representations", CVPR 2019. What
+descends is the turn of each joint from the T-pose to the world, not from its parent: a step of the spine then
+carries the arms along without turning them, and a hundred steps reach the optimum that local rotations miss.
 """
 
 from __future__ import annotations
@@ -20,16 +22,19 @@ from soma_core.inversion.comparison import part_of
 from soma_core.inversion.gauss_newton import GaussNewton
 from soma_core.inversion.problem import Pose, Problem
 
-__all__ = ["Autograd", "AutogradOptions", "from_six", "to_six"]
+__all__ = ["Autograd", "AutogradOptions", "from_six"]
 
 _POSED_AT_A_TIME = 64
 """Frames that pass through skinning together, which bounds memory; frames do not influence each other."""
 
 _Loss = Callable[[Tensor, Tensor], Tensor]
-"""(F,) from rotations (F, J, 3, 3) and translations (F, 3)."""
+"""(F,) from turns (F, J, 3, 3) and translations (F, 3)."""
 
 _MM2 = 1e6
 """Square metres to square millimetres: keeps gradients far above Adam's epsilon."""
+
+_BETAS = (0.8, 0.9)
+"""Adam's memory, shorter than usual: of a hundred steps, the first say little about the last."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -38,7 +43,7 @@ class AutogradOptions:
 
     Attributes:
         iterations: number of steps of Adam.
-        rate: first learning rate of the rotations, about the angle [rad] of a joint's first step.
+        rate: first learning rate of the turns, about the angle [rad] of a joint's first step.
         shift_rate: first learning rate of the translation, about its first step [m].
         final: last learning rate, relative to the first; it falls along a half cosine.
         regions: factor on the vertex weights of a region of ``body_regions``: body, hands, feet, head or
@@ -94,11 +99,6 @@ class AutogradOptions:
         """Learning rate of a step, relative to the first."""
         done = step / max(self.iterations - 1, 1)
         return self.final + (1 - self.final) * 0.5 * (1 + math.cos(math.pi * min(done, 1)))
-
-
-def to_six(rotation: Tensor) -> Tensor:
-    """First two columns of rotations, (..., 3, 3) -> (..., 3, 2)."""
-    return rotation[..., :2]
 
 
 def from_six(columns: Tensor) -> Tensor:
@@ -162,12 +162,13 @@ class Autograd(torch.nn.Module):
         with torch.inference_mode(mode=False), torch.enable_grad():
             problem, start = _usable(problem), _usable(start)
             if self.options.loss == "moments":
-                return self._descend(start, self._by_moments(problem, start))
-            parts = []
+                return self._descend(start, problem.rest.offsets, self._by_moments(problem, start))
+            parts, offsets = [], problem.rest.offsets
             for first in range(0, len(start.relative), _POSED_AT_A_TIME):
                 chunk = slice(first, first + _POSED_AT_A_TIME)
                 part = Pose(**{name: value[chunk] for name, value in vars(start).items()})
-                parts.append(self._descend(part, self._by_vertices(problem, chunk)))
+                bones = offsets[chunk] if len(offsets) > 1 else offsets
+                parts.append(self._descend(part, bones, self._by_vertices(problem, part, chunk)))
             return Pose(**{name: torch.cat([getattr(part, name) for part in parts]) for name in vars(start)})
 
     def _by_moments(self, problem: Problem, start: Pose) -> _Loss:
@@ -177,15 +178,16 @@ class Autograd(torch.nn.Module):
         turns, places = solver.walk(start, rest.offsets)
         residual = solver.gradient(turns, places, second, problem.target)
 
-        def loss(relative: Tensor, shift: Tensor) -> Tensor:
-            turned, placed = self.animation.kinematics.walk(relative[:, 1:], rest.offsets, shift)
+        def loss(turned: Tensor, shift: Tensor) -> Tensor:
+            above = turned[:, solver.parents]
+            placed = self.animation.kinematics.positions(above, rest.offsets, shift)
             change = torch.cat((turned - turns, (placed - places)[..., None]), -1)[:, joints]
             product = solver.times_second(change, second)
             return (change * (product + 2 * residual)).sum((1, 2, 3)) / mass
 
         return loss
 
-    def _by_vertices(self, problem: Problem, chunk: slice) -> _Loss:
+    def _by_vertices(self, problem: Problem, start: Pose, chunk: slice) -> _Loss:
         """Weighted mean of the penalised squared distances [m^2] under the forward model."""
         penalty, identity = self.options.penalty, part_of(problem.identity, chunk)
         target = problem.vertices[chunk] - problem.origin[chunk, None]
@@ -195,49 +197,51 @@ class Autograd(torch.nn.Module):
         )
         total = weights.sum(1).clamp_min(torch.finfo(weights.dtype).tiny)
 
-        def loss(relative: Tensor, shift: Tensor) -> Tensor:
-            posed = self.animation.pose(identity, relative[:, 1:], shift, absolute=False, bone_scale=scale)
+        def loss(turned: Tensor, shift: Tensor) -> Tensor:
+            relative = self._relative(start, turned)[:, 1:]
+            posed = self.animation.pose(identity, relative, shift, absolute=False, bone_scale=scale)
             squared = (posed.vertices - target).square().sum(-1)
             return (weights * (squared if penalty is None else penalty(squared))).sum(1) / total
 
         return loss
 
-    def _descend(self, start: Pose, loss: _Loss) -> Pose:
-        """Adam on the first two columns of every variable rotation and on the translation."""
+    def _descend(self, start: Pose, offsets: Tensor, loss: _Loss) -> Pose:
+        """Adam on the first two columns of every variable turn and on the translation."""
         options, n = self.options, self.solver.variables
-        six = to_six(start.relative[:, n]).clone().requires_grad_()
-        shift = start.translation.clone().requires_grad_()
+        turns, _ = self.solver.walk(start, offsets)
+        six, shift = turns[:, n, :, :2].clone().requires_grad_(), start.translation.clone().requires_grad_()
         groups = [{"params": [six], "lr": options.rate}, {"params": [shift], "lr": options.shift_rate}]
-        adam = torch.optim.Adam(groups)
+        adam = torch.optim.Adam(groups, betas=_BETAS)
         fall = torch.optim.lr_scheduler.LambdaLR(adam, options.decay)
-        best = start
         with torch.no_grad():
-            lowest = last = loss(start.relative, start.translation)
+            lowest = value = loss(turns, start.translation)
+        best_six, best_shift = six.detach().clone(), start.translation.clone()
+        taken = torch.zeros_like(start.accepted)
         for step in range(options.iterations + 1):
-            relative = start.relative.index_copy(1, n, from_six(six))
-            value = loss(relative, shift)
-            best, lowest = _better(best, lowest, relative.detach(), shift.detach(), value.detach())
-            if step == options.iterations:
-                break
-            six.grad, shift.grad = torch.autograd.grad(_MM2 * value.sum(), (six, shift))
-            last = value.detach()
-            adam.step()
-            fall.step()
-        return replace(best, last_change=(value.detach() - last).abs().sqrt())
+            last, value = value.detach(), loss(turns.index_copy(1, n, from_six(six)), shift)
+            better = value.detach() < lowest
+            taken = taken + better
+            lowest = torch.where(better, value.detach(), lowest)
+            best_six = torch.where(better[:, None, None, None], six.detach(), best_six)
+            best_shift = torch.where(better[:, None], shift.detach(), best_shift)
+            if step < options.iterations:
+                six.grad, shift.grad = torch.autograd.grad(_MM2 * value.sum(), (six, shift))
+                adam.step()
+                fall.step()
+        found = self._relative(start, turns.index_copy(1, n, from_six(best_six)))
+        return replace(
+            start,
+            relative=torch.where((taken > 0)[:, None, None, None], found, start.relative),
+            translation=best_shift,
+            accepted=start.accepted + taken,
+            last_change=(value.detach() - last).abs().sqrt(),
+        )
 
-
-def _better(
-    best: Pose, lowest: Tensor, relative: Tensor, shift: Tensor, value: Tensor
-) -> tuple[Pose, Tensor]:
-    """The better state of each frame."""
-    better = value < lowest
-    pose = replace(
-        best,
-        relative=torch.where(better[:, None, None, None], relative, best.relative),
-        translation=torch.where(better[:, None], shift, best.translation).clone(),
-        accepted=best.accepted + better,
-    )
-    return pose, torch.where(better, value, lowest)
+    def _relative(self, start: Pose, turns: Tensor) -> Tensor:
+        """Relative rotations (F, J, 3, 3) of turns; joints that carry no weight follow their parent."""
+        n = self.solver.variables
+        above = turns[:, self.solver.parents[n]]
+        return start.relative.index_copy(1, n, above.transpose(-1, -2) @ turns[:, n])
 
 
 def _usable(value: Any) -> Any:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import replace
 
 import torch
@@ -12,10 +13,13 @@ from soma_core.animation.skinning import skinning_transforms
 from soma_core.inversion.problem import Problem
 from soma_core.skeleton.identity import Identity
 
-__all__ = ["compare", "part_of"]
+__all__ = ["clipped_targets", "compare", "part_of"]
 
 _POSED_AT_A_TIME = 32
 """Frames posed and compared at a time by the reference, so that they stay in cache."""
+
+_SAMPLED = 8
+"""Every so many vertices have a say in a frame's median residual."""
 
 
 def compare(
@@ -35,16 +39,43 @@ def compare(
         error, total = _by_warp(animation, problem, relative, translation)
     else:
         error = problem.vertices.new_empty(problem.vertices.shape[:2])
-        for first in range(0, len(error), _POSED_AT_A_TIME):
-            chunk = slice(first, first + _POSED_AT_A_TIME)
-            scale, who = problem.bone_scale, part_of(identity, chunk)
-            scale = scale[chunk] if scale is not None and len(scale) > 1 else scale
-            turns, places = relative[chunk], translation[chunk]
-            posed = animation.pose(who, turns, places, absolute=False, bone_scale=scale)
-            step = posed.vertices.sub_(problem.vertices[chunk])
+        for chunk, posed in _posed(animation, problem, relative, translation):
+            step = posed.sub_(problem.vertices[chunk])
             torch.linalg.vector_norm(step, dim=-1, out=error[chunk])
         total = (error * error * weights).sum(1)
     return error, (total / weights.sum(1).clamp_min(torch.finfo(weights.dtype).tiny)).sqrt()
+
+
+def clipped_targets(
+    animation: Animation, problem: Problem, relative: Tensor, translation: Tensor, *, scale: float
+) -> Tensor:
+    """Targets (F, v, 3) [m]; those too far from their posed vertex are brought as near as `scale` [m].
+
+    Too far is farther than `scale` and than twice the frame's median: a fit that outliers have dragged off
+    finds its way back in few rounds.
+    """
+    clipped, weights = torch.empty_like(problem.vertices), problem.weights
+    for chunk, posed in _posed(animation, problem, relative, translation):
+        step = problem.vertices[chunk] - posed
+        length = torch.linalg.vector_norm(step, dim=-1)
+        counted = (weights[chunk] if len(weights) > 1 else weights)[:, ::_SAMPLED] > 0
+        typical = length[:, ::_SAMPLED].masked_fill(~counted, torch.nan).nanmedian(1, keepdim=True).values
+        bound = (2 * typical.nan_to_num(0.0)).clamp_min(scale)
+        share = bound / torch.maximum(length, bound)
+        torch.addcmul(posed, step, share[..., None], out=clipped[chunk])
+    return clipped
+
+
+def _posed(
+    animation: Animation, problem: Problem, relative: Tensor, translation: Tensor
+) -> Iterator[tuple[slice, Tensor]]:
+    """Reconstruction of a few frames at a time."""
+    for first in range(0, len(relative), _POSED_AT_A_TIME):
+        chunk = slice(first, first + _POSED_AT_A_TIME)
+        scale, who = problem.bone_scale, part_of(problem.identity, chunk)
+        scale = scale[chunk] if scale is not None and len(scale) > 1 else scale
+        turns, places = relative[chunk], translation[chunk]
+        yield chunk, animation.pose(who, turns, places, absolute=False, bone_scale=scale).vertices
 
 
 def _by_warp(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Sequence
-from dataclasses import fields, replace
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import torch
@@ -13,12 +13,15 @@ from torch import Tensor
 from soma_core._inputs import check_bone_scale
 from soma_core.errors import InputError
 from soma_core.inversion._inputs import check_vertices, check_weights, refuse_unit_error
+from soma_core.inversion.analytical import AnalyticalOptions
+from soma_core.inversion.autograd import AutogradOptions
 from soma_core.inversion.comparison import compare, part_of
-from soma_core.inversion.gauss_newton import GaussNewton
+from soma_core.inversion.ladder import Ladder, LadderOptions, Stage
 from soma_core.inversion.moments import RestMoments, SkinMoments
+from soma_core.inversion.priors import PosePriors, joint_terms, neighbour_mean, with_references
 from soma_core.inversion.problem import Pose, Problem
-from soma_core.inversion.result import InversionResult
-from soma_core.inversion.start import ProcrustesStart, best_translation, cloud_extent
+from soma_core.inversion.result import InversionResult, joined
+from soma_core.inversion.start import cloud_extent
 from soma_core.inversion.structure import moment_structure
 from soma_core.layer import SomaLayer
 from soma_core.rig import load_canonical
@@ -26,12 +29,9 @@ from soma_core.skeleton.identity import Identity
 from soma_core.topology.correspondence import load_correspondence
 from soma_core.topology.transfer import make_transfer
 
-__all__ = ["PoseInversion", "Stage", "Topology"]
+__all__ = ["PoseInversion", "Topology"]
 
-Stage = Literal["procrustes", "gauss_newton"]
 Topology = Literal["canonical", "native"]
-
-_STAGES: tuple[Stage, ...] = ("procrustes", "gauss_newton")
 
 _CHUNK = 512
 """Frames fitted at a time: enough to fill the SIMD lanes of every core, little enough for memory."""
@@ -43,6 +43,32 @@ _COLLAPSED = 0.1
 """A joint whose cloud has less than this share of its extent left cannot be determined."""
 
 
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Frames:
+    """What is given for some frames: see :meth:`PoseInversion.forward`; `reference` for a temporal prior."""
+
+    vertices: Tensor
+    identity: Identity
+    weights: Tensor
+    bone_scale: Tensor | None
+    rest: RestMoments | None
+    initial: InversionResult | None = None
+    reference: Tensor | None = None
+
+    def part(self, chunk: slice) -> _Frames:
+        """What is given for a chunk of them."""
+        scale = self.bone_scale
+        return _Frames(
+            vertices=self.vertices[chunk],
+            identity=part_of(self.identity, chunk),
+            weights=self.weights[chunk] if len(self.weights) > 1 else self.weights,
+            bone_scale=scale[chunk] if scale is not None and len(scale) > 1 else scale,
+            rest=self.rest,
+            initial=None if self.initial is None else self.initial.part(chunk),
+            reference=None if self.reference is None else self.reference[chunk],
+        )
+
+
 class PoseInversion(torch.nn.Module):
     """Recovers the rig's rotations from posed vertices; keeps no state between calls.
 
@@ -51,14 +77,13 @@ class PoseInversion(torch.nn.Module):
 
     Args:
         layer: makes identities, and poses them; its LOD is the LOD of the fit.
-        stages: what to do, in order: ``procrustes`` starts, ``gauss_newton`` refines.
-        iterations: largest number of steps of ``gauss_newton``.
-        tolerance: a frame has converged when a step changes its root mean square error, squared, by less than
-            this, squared [m].
         kernels: ``torch`` (the reference), ``warp`` or ``auto``.
+        priors: joint limits, hinges, a rest pose, smooth motion.
+        stages, iterations, tolerance, analytical, autograd, robust, robust_rounds: see
+            :class:`LadderOptions`.
 
     Raises:
-        InputError: an unknown stage, or a negative number of iterations.
+        InputError: an option out of range, or a prior on a joint that no fit can determine.
     """
 
     def __init__(
@@ -68,26 +93,27 @@ class PoseInversion(torch.nn.Module):
         stages: Sequence[Stage] = ("procrustes", "gauss_newton"),
         iterations: int = 12,
         tolerance: float = 5e-5,
+        analytical: AnalyticalOptions | None = None,
+        autograd: AutogradOptions | None = None,
+        robust: float | None = None,
+        robust_rounds: int = 10,
+        priors: PosePriors | None = None,
         kernels: Literal["auto", "torch", "warp"] = "auto",
     ) -> None:
         super().__init__()
-        for stage in stages:
-            if stage not in _STAGES:
-                names = ", ".join(_STAGES)
-                raise InputError(
-                    "stages", got=repr(stage), expected=f"among {names}", fix="Correct the name."
-                )
-        if iterations < 0:
-            raise InputError("iterations", got=iterations, expected="at least 0", fix="Pass iterations=12.")
-        self.layer, self.stages = layer, tuple(stages)
-        self.iterations, self.tolerance = iterations, tolerance
+        options = LadderOptions(
+            stages=stages, iterations=iterations, tolerance=tolerance, robust=robust,
+            robust_rounds=robust_rounds, analytical=analytical or AnalyticalOptions(),
+            autograd=autograd or AutogradOptions(),
+        )  # fmt: skip
+        self.layer, self.priors = layer, priors or PosePriors()
         # Not measured on CUDA, where one thread would hold a whole frame: the dense reference runs there.
         self.warp = warp = kernels == "warp" or (kernels == "auto" and layer.device.type == "cpu")
         structure = moment_structure(layer.mesh, layer.rig)
         kind = {"dtype": layer.dtype, "device": layer.device}
         self.moments = SkinMoments(structure, layer.rig, warp=warp, **kind)
-        self.solver = GaussNewton(structure, warp=warp, **kind)
-        self.start = ProcrustesStart(structure, **kind)
+        self.ladder = Ladder(layer, structure, self.moments, options, warp=warp)
+        self.terms = joint_terms(self.priors, [layer.rig.joint_names[j] for j in structure.variables], **kind)
         fitted = torch.as_tensor(structure.fitted, device=layer.device)
         self.register_buffer("default_weights", fitted.to(layer.dtype), persistent=False)
 
@@ -106,8 +132,9 @@ class PoseInversion(torch.nn.Module):
         topology: Topology = "canonical",
         weights: Tensor | None = None,
         bone_scale: Tensor | None = None,
+        initial: InversionResult | None = None,
     ) -> InversionResult:
-        """Fit every frame on its own.
+        """Fit every frame on its own, unless a temporal prior ties neighbours together.
 
         Args:
             vertices: (F, n, 3); canonical: [m], +Y up, in the order of ``layer.mesh``; native: the
@@ -117,6 +144,7 @@ class PoseInversion(torch.nn.Module):
             weights: (v,) or (F, v) weights of canonical vertices; zero leaves a vertex out, NaN or not.
                 Default 1, and 0 in the face interior.
             bone_scale: (1 or F, J - 1) known factors of the bone vectors, as in ``SomaLayer.pose``.
+            initial: an earlier result for these frames, in place of the starting stages.
 
         Raises:
             InputError: a wrong shape, a negative weight or bone scale, or vertices in another unit than they
@@ -135,24 +163,33 @@ class PoseInversion(torch.nn.Module):
         user_joints = self.layer.rig.joint_count - 1
         bone_scale = check_bone_scale(bone_scale, count, user_joints, self.layer.dtype, self.layer.device)
         shared = identity.batch_size == 1 and len(weights) == 1
-        rest = self.prepare(identity, weights) if shared else None
-        parts, scales = [], []
-        for first in range(0, count, _CHUNK) or (0,):
-            chunk = slice(first, first + _CHUNK)
-            who, weight = part_of(identity, chunk), weights[chunk] if len(weights) > 1 else weights
-            bones = bone_scale[chunk] if bone_scale is not None and len(bone_scale) > 1 else bone_scale
-            part, scale = self._fit(vertices[chunk], who, weight, rest, bones)
-            parts.append(part)
-            scales.append(scale)
-        if not bool(torch.cat([part.valid for part in parts]).any()):
-            refuse_unit_error(torch.cat(scales))
-        return _joined(parts)
+        frames = _Frames(
+            vertices=vertices, identity=identity, weights=weights, bone_scale=bone_scale, initial=initial,
+            rest=self.prepare(identity, weights) if shared else None,
+        )  # fmt: skip
+        result = self._fit_all(frames)
+        strength = self.priors.temporal_strength
+        for _ in range(self.priors.temporal_rounds if strength else 0):
+            variables = result.rotations[:, self.ladder.solver.variables - 1]
+            reference = neighbour_mean(variables, result.valid)
+            result = self._fit_all(replace(frames, initial=result, reference=reference))
+        return result
+
+    def _fit_all(self, frames: _Frames) -> InversionResult:
+        """Fit chunk by chunk."""
+        count = len(frames.vertices)
+        fits = [
+            self._fit(frames.part(slice(first, first + _CHUNK))) for first in range(0, count, _CHUNK) or (0,)
+        ]
+        if not any(bool(result.valid.any()) for result, _ in fits):
+            refuse_unit_error(torch.cat([scale for _, scale in fits]))
+        return joined([result for result, _ in fits])
 
     def _canonical(self, vertices: Tensor, topology: Topology) -> Tensor:
         layer = self.layer
         if topology == "native":
             vertices = check_vertices(vertices, -1, fix="Pass the backend's own vertices.")
-            return self._transfer(vertices.to(layer.device, layer.dtype))
+            return self._to_canonical(vertices.to(layer.device, layer.dtype))
         if topology != "canonical":
             raise InputError(
                 "topology", got=repr(topology), expected="'canonical' or 'native'", fix="Correct the name."
@@ -162,39 +199,40 @@ class PoseInversion(torch.nn.Module):
         return vertices.to(layer.device, layer.dtype)
 
     @functools.cached_property
-    def _transfer(self) -> torch.nn.Module:
+    def _to_canonical(self) -> torch.nn.Module:
         """Native vertices to the canonical mesh; made when first asked for."""
         layer, wrap = self.layer, self.layer.spec.wrap
         mid = layer.mesh if layer.mesh.lod == "mid" else load_canonical("mid")[0]
         correspondence = None if wrap is None else load_correspondence(wrap, mid)
         return make_transfer(layer.spec, layer.mesh, correspondence, dtype=layer.dtype, device=layer.device)
 
-    def _fit(
-        self,
-        vertices: Tensor,
-        identity: Identity,
-        weights: Tensor,
-        rest: RestMoments | None,
-        bone_scale: Tensor | None,
-    ) -> tuple[InversionResult, Tensor]:
+    def _fit(self, frames: _Frames) -> tuple[InversionResult, Tensor]:
         """Result and scale of a chunk of frames."""
-        vertices, finite = _without_gaps(vertices, weights, self.layer)
-        offsets = self.layer.animation.bone_vectors(identity, bone_scale)
+        vertices, finite = _without_gaps(frames.vertices, frames.weights, self.layer)
+        identity, weights, rest = frames.identity, frames.weights, frames.rest
+        offsets = self.layer.animation.bone_vectors(identity, frames.bone_scale)
         if rest is None:
             rest, target, origin = self.moments.each(vertices, identity, weights, offsets)
         else:
             rest = replace(rest, offsets=offsets)
             target, origin = self.moments.target(vertices, rest)
+        terms, strength = self.terms, self.priors.temporal_strength
+        if frames.reference is not None:
+            terms = with_references(terms, frames.reference, strength)
         problem = Problem(
             vertices=vertices, weights=weights, identity=identity, rest=rest, target=target, origin=origin,
-            bone_scale=bone_scale,
+            bone_scale=frames.bone_scale, terms=terms,
         )  # fmt: skip
         extent, side = cloud_extent(target, rest)
         scale = extent.median(1).values
         upright = (side * rest.own[..., 3, 3]).sum(1) > 0
         usable = finite & upright & (scale > _SCALES[0]) & (scale < _SCALES[1])
-        pose = self._climb(problem)
         eye = torch.eye(3, dtype=vertices.dtype, device=vertices.device)
+        start = None
+        if frames.initial is not None:
+            relative = torch.cat((eye.expand(len(origin), 1, 3, 3), frames.initial.rotations), 1)
+            start = Pose.begin(relative, frames.initial.translation - origin)
+        pose = self.ladder(problem, start)
         relative = torch.where(usable[:, None, None, None], pose.relative, eye)[:, 1:]
         translation = torch.where(usable[:, None], pose.translation + origin, torch.zeros_like(origin))
         error, residual = compare(self.layer.animation, problem, relative, translation, warp=self.warp)
@@ -205,33 +243,10 @@ class PoseInversion(torch.nn.Module):
             vertex_error=error,
             valid=usable,
             determined=self._determined(extent > _COLLAPSED) & usable[:, None],
-            converged=(pose.last_change < self.tolerance) & usable,
+            converged=(pose.last_change < self.ladder.options.tolerance) & usable,
             iterations=pose.accepted,
             residual=residual,
         ), scale
-
-    def _climb(self, problem: Problem) -> Pose:
-        """Run the stages, each from the result of the one before."""
-        pose = None
-        for stage in self.stages:
-            pose = getattr(self, f"_{stage}")(problem, pose)
-        assert pose is not None
-        return pose
-
-    def _procrustes(self, problem: Problem, _pose: Pose | None) -> Pose:
-        """Weighted Procrustes of every joint's own points."""
-        target, rest = problem.target, problem.rest
-        pose = Pose.begin(self.start(target, rest), torch.zeros_like(problem.origin))
-        turns, places = self.solver.walk(pose, rest.offsets)
-        joints = self.moments.joints
-        return replace(pose, translation=best_translation(target, rest, turns[:, joints], places[:, joints]))
-
-    def _gauss_newton(self, problem: Problem, pose: Pose | None) -> Pose:
-        """Levenberg-Marquardt on the moments."""
-        pose = pose or self._procrustes(problem, None)
-        return self.solver(
-            problem.target, problem.rest, pose, iterations=self.iterations, tolerance=self.tolerance
-        )
 
     def _determined(self, kept: Tensor) -> Tensor:
         """(F, J - 1) from the weighted joints (F, T): whether the target determines a user joint."""
@@ -252,10 +267,3 @@ def _without_gaps(vertices: Tensor, weights: Tensor, layer: SomaLayer) -> tuple[
     whole = (known | (weights == 0)).all(1)
     bind = torch.tensor(layer.rig.bind_shape, dtype=vertices.dtype, device=vertices.device)
     return torch.where((known & whole[:, None])[..., None], vertices, bind), whole
-
-
-def _joined(parts: Sequence[InversionResult]) -> InversionResult:
-    if len(parts) == 1:
-        return parts[0]
-    names = [one.name for one in fields(InversionResult)]
-    return InversionResult(**{name: torch.cat([getattr(part, name) for part in parts]) for name in names})

@@ -18,6 +18,7 @@ from soma_core.animation.kinematics import joint_levels
 from soma_core.geometry.rotations import cayley, skew
 from soma_core.inversion.elimination import elimination_plan
 from soma_core.inversion.moments import RestMoments
+from soma_core.inversion.priors import JointTerms
 from soma_core.inversion.problem import Pose
 from soma_core.inversion.structure import MomentStructure
 
@@ -29,6 +30,9 @@ _LOWER, _RAISE, _MOST_DAMPING = 0.2, 8.0, 1e6
 
 _RIDGE = 1e-9
 """Relative to the mean diagonal: keeps the factorisation defined where a joint moves nothing."""
+
+_HINGE = 1e3
+"""Stiffness of a hinge across its axis, relative to what the vertices have to say of the joint."""
 
 _LONGEST_STEP = 1.0
 """A joint turns by at most this angle [rad] in one step."""
@@ -73,7 +77,14 @@ class GaussNewton(torch.nn.Module):
         self.register_buffer("eye", torch.eye(3, dtype=dtype, device=device), persistent=False)
 
     def forward(
-        self, target: Tensor, rest: RestMoments, start: Pose, *, iterations: int, tolerance: float = 0.0
+        self,
+        target: Tensor,
+        rest: RestMoments,
+        start: Pose,
+        *,
+        iterations: int,
+        tolerance: float = 0.0,
+        terms: JointTerms | None = None,
     ) -> Pose:
         """Refine `start`; never worse than it.
 
@@ -84,9 +95,10 @@ class GaussNewton(torch.nn.Module):
             iterations: number of steps tried; a step that would raise the energy is undone and damped.
             tolerance: a frame rests once a step changed its energy by less, as a root mean square [m],
                 whatever its neighbours do.
+            terms: soft terms on single joints, and hinges; `start` must keep the hinges.
         """
         if self.plan is not None and iterations:
-            return self._by_warp(target, rest, start, iterations, tolerance)
+            return self._by_warp(target, rest, start, iterations, tolerance, terms)
         second = self.dense(rest.second)
         pose = start
         turns, places = self.walk(pose, rest.offsets)
@@ -96,12 +108,21 @@ class GaussNewton(torch.nn.Module):
         moving = torch.ones_like(pose.last_change, dtype=torch.bool)
         for _ in range(iterations):
             matrix, slope = self.normal_equations(turns, places, rest.second, residual)
+            if terms is not None:
+                self._add_terms(matrix, slope, pose.relative, turns, terms, mass)
             step = self._solve(matrix, slope, damping)
+            if terms is not None:
+                step = self._along_hinges(step, turns, terms)
             trial = self._retract(pose, turns, step)
             trial_turns, trial_places = self.walk(trial, rest.offsets)
             change = torch.cat((trial_turns - turns, (trial_places - places)[..., None]), -1)[:, self.joints]
             product = self.times_second(change, second)
             energy = (change * (product + 2 * residual)).sum((1, 2, 3))
+            if terms is not None:
+                n = self.variables
+                energy = energy + mass * (
+                    terms.energy(trial.relative[:, n]) - terms.energy(pose.relative[:, n])
+                )
             better = moving & (energy < 0)
             keep = better[:, None, None, None]
             pose = Pose(
@@ -117,8 +138,38 @@ class GaussNewton(torch.nn.Module):
             damping = (damping * torch.where(better, _LOWER, _RAISE).to(damping)).clamp_max(_MOST_DAMPING)
         return pose
 
+    def _add_terms(
+        self, matrix: Tensor, slope: Tensor, relative: Tensor, turns: Tensor, terms: JointTerms, mass: Tensor
+    ) -> None:
+        """Add the terms to the normal equations, and make turns of hinges off their axis too costly."""
+        n = self.variables
+        above = turns[:, self.parents[n]]
+        blocks, slopes = terms.normal_equations(relative[:, n], above)
+        each = torch.arange(len(n), device=matrix.device)
+        # Indexing two axes at once puts them first: (n, F, 3, 3).
+        own = matrix[:, each, :, each] + (mass[:, None, None, None] * blocks).transpose(0, 1)
+        axis = (above @ terms.hinge_axis[..., None]).squeeze(-1).transpose(0, 1)
+        hinge = (terms.hinge_axis != 0).any(-1)[:, None]
+        stiff = hinge * _HINGE * own.diagonal(dim1=-2, dim2=-1).sum(-1)
+        across = self.eye - axis[..., :, None] * axis[..., None, :]
+        matrix[:, each, :, each] = own + stiff[..., None, None] * across
+        slope[:, : len(n)] += mass[:, None, None] * slopes
+
+    def _along_hinges(self, step: Tensor, turns: Tensor, terms: JointTerms) -> Tensor:
+        """The part of each hinge's step that lies along its axis."""
+        axis = (turns[:, self.parents[self.variables]] @ terms.hinge_axis[..., None]).squeeze(-1)
+        along = (step[:, :-1] * axis).sum(-1, keepdim=True) * axis
+        hinge = (terms.hinge_axis != 0).any(-1)[None, :, None]
+        return torch.cat((torch.where(hinge, along, step[:, :-1]), step[:, -1:]), 1)
+
     def _by_warp(
-        self, target: Tensor, rest: RestMoments, start: Pose, iterations: int, tolerance: float
+        self,
+        target: Tensor,
+        rest: RestMoments,
+        start: Pose,
+        iterations: int,
+        tolerance: float,
+        terms: JointTerms | None,
     ) -> Pose:
         from soma_core.kernels.gauss_newton_wp import gauss_newton
 
@@ -126,7 +177,8 @@ class GaussNewton(torch.nn.Module):
         relative, translation, accepted, energy = gauss_newton(
             self.plan, target, rest.second, rest.offsets, start.relative, start.translation,
             (tolerance**2 * mass).expand(len(target)), iterations=iterations,
-            damping=(_START_DAMPING, _LOWER, _RAISE, _MOST_DAMPING), longest=_LONGEST_STEP,
+            damping=(_START_DAMPING, _LOWER, _RAISE, _MOST_DAMPING), longest=_LONGEST_STEP, hinge=_HINGE,
+            terms=None if terms is None else (vars(terms), mass.expand(len(target))),
         )  # fmt: skip
         return Pose(
             relative=relative,

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from soma_core.inversion.moments import RestMoments
+from soma_core.inversion.priors import JointTerms
 from soma_core.skeleton.identity import Identity
 
 __all__ = ["Pose", "Problem"]
@@ -25,6 +26,7 @@ class Problem:
         target: ``R`` (F, T, 3, 4) of the targets, about `origin`.
         origin: (F, 3) [m]; poses under way are relative to it.
         bone_scale: factors (1 or F, J - 1) of the bone vectors, already in ``rest.offsets``; None without.
+        terms: soft terms and hinges; None without.
     """
 
     vertices: Tensor
@@ -34,6 +36,7 @@ class Problem:
     target: Tensor
     origin: Tensor
     bone_scale: Tensor | None = None
+    terms: JointTerms | None = None
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
 
+import torch
 from torch import Tensor
 
-__all__ = ["InversionResult"]
+__all__ = ["InversionResult", "joined"]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -37,3 +39,15 @@ class InversionResult:
     converged: Tensor
     iterations: Tensor
     residual: Tensor
+
+    def part(self, chunk: slice) -> InversionResult:
+        """The result of a chunk of frames."""
+        return InversionResult(**{one.name: getattr(self, one.name)[chunk] for one in fields(self)})
+
+
+def joined(parts: Sequence[InversionResult]) -> InversionResult:
+    """One result of consecutive chunks of frames."""
+    if len(parts) == 1:
+        return parts[0]
+    names = [one.name for one in fields(InversionResult)]
+    return InversionResult(**{name: torch.cat([getattr(part, name) for part in parts]) for name in names})

@@ -14,6 +14,7 @@ from torch import Tensor
 
 from soma_core.kernels._gn_assembly import Plan, assembly_functions
 from soma_core.kernels._gn_factor import factor_functions
+from soma_core.kernels._gn_terms import term_functions, terms_struct
 from soma_core.kernels._gn_tree import tree_functions
 from soma_core.kernels._lanes import as_lanes, from_lanes, in_threads, lane_count, lane_types, to_lanes
 from soma_core.kernels._runtime import launching, scalar_name
@@ -26,7 +27,7 @@ def _kernel(scalar: str, lanes: int, *, shared: bool):
     types, tree = lane_types(scalar, lanes), tree_functions(scalar, lanes, shared=shared)
     real, vec, frames, constants = types.real, types.vec, tree.frames, tree.constants
     assembly, factor = assembly_functions(scalar, lanes, shared=shared), factor_functions(scalar, lanes)
-    state = _state(scalar, lanes)
+    state, terms, term = _state(scalar, lanes), terms_struct(scalar, lanes), term_functions(scalar, lanes)
     damp, change, accept = _damp(types, state), _change(types, state), _accept(types, state)
     energy_change = _energy_change(types, state)
     module = wp.get_module(f"soma_gauss_newton_{scalar}_{lanes}_{'one' if shared else 'each'}")
@@ -36,8 +37,9 @@ def _kernel(scalar: str, lanes: int, *, shared: bool):
     @wp.kernel(module=module, enable_backward=False)
     def solve(
         plan: Plan, s: state, iterations: int, start_damping: real, lower: real, higher: real,
-        most: real, longest: real, second: constants, offsets: constants, threshold: frames, target: frames,
-        relative: frames, hips: frames, accepted: frames, last_change: frames,
+        most: real, longest: real, hinge: real, t: terms, second: constants, offsets: constants,
+        threshold: frames, target: frames, relative: frames, hips: frames, accepted: frames,
+        last_change: frames,
     ):  # fmt: skip
         w = wp.tid()
         for g in range(w, target.shape[0], s.turns.shape[0]):
@@ -62,9 +64,12 @@ def _kernel(scalar: str, lanes: int, *, shared: bool):
                 assembly.moments(w, g, plan, second, s.turns, s.places, s.column, s.blocks, s.root)
                 assembly.finish(w, plan, s.blocks)
                 assembly.forces(w, plan, s.turns, s.places, s.residual, s.spread, s.force, s.slope)
+                before = term.add(w, g, plan, s.relative, s.turns, t, s.scratch, s.blocks, s.slope)
+                term.stiffen(w, plan, hinge, s.turns, t, s.scratch, s.blocks)
                 damp(w, plan, damping, s)
                 factor.factorise(w, plan, s.blocks, s.carry, s.last, s.inverse)
                 factor.solve(w, plan, s.blocks, s.carry, s.last, s.inverse, s.slope)
+                term.project(w, plan, s.turns, t, s.scratch, s.slope)
                 for k in range(plan.joint.shape[0]):
                     x = -s.slope[w, 3 * k]
                     y = -s.slope[w, 3 * k + 1]
@@ -82,7 +87,8 @@ def _kernel(scalar: str, lanes: int, *, shared: bool):
                 )
                 change(w, plan, s.trial_turns, s.trial_places, s)
                 tree.times_second(w, g, plan.pairs, second, s.change, s.product)
-                gained = energy_change(w, s)
+                gained = energy_change(w, s) - before
+                gained += term.energy(w, g, plan, s.trial_relative, t, s.scratch)
                 better = wp.cw_mul(moving, types.below(gained, real(0.0)))
                 accept(w, better, s)
                 count += better
@@ -130,6 +136,7 @@ def _state(scalar: str, lanes: int):
         spread: frames
         force: frames
         slope: frames
+        scratch: frames
 
     return State
 
@@ -245,7 +252,7 @@ class GaussNewtonPlan:
             "trial_relative": 9 * j, "trial_hips": 3, "trial_turns": 9 * j, "trial_places": 3 * j,
             "trial": t, "residual": t, "change": t, "product": t, "column": 16 * j,
             "blocks": 12 * self.slots, "root": 4 * n, "carry": 9 * n, "last": 9, "inverse": 3 * n + 3,
-            "spread": 9 * j, "force": 3 * j, "slope": 3 * n + 3,
+            "spread": 9 * j, "force": 3 * j, "slope": 3 * n + 3, "scratch": 8,
         }  # fmt: skip
         types, state, memory = lane_types(scalar, lanes), _state(scalar, lanes)(), {}
         for name, size in sizes.items():
@@ -256,9 +263,36 @@ class GaussNewtonPlan:
         return state, memory
 
 
+def _terms(given: tuple[Mapping[str, Tensor], Tensor] | None, scalar: str, lanes: int, like: Tensor):
+    """A function from a part of the groups to its terms; empty ones where none are given."""
+    types, struct = lane_types(scalar, lanes), terms_struct(scalar, lanes)
+    fields, mass = given if given is not None else ({}, like.new_ones(len(like)))
+    count, hinged = len(fields.get("variable", ())), fields.get("hinge_axis", like.new_zeros(1, 3)).flip(0)
+    none = like.new_zeros(1)  # Warp takes no empty array
+    # Columns are the variable joints in descending order.
+    column = len(hinged) - 1 - fields["variable"].to(torch.int32) if count else none.to(torch.int32)
+    numbers = [(fields[name] if count else none).contiguous() for name in ("stiffness", "free")]
+    reference = fields["reference"].expand(len(like), -1, 3, 3) if count else like.new_zeros(len(like), 1)
+    groups = to_lanes(reference, lanes), to_lanes(mass[:, None], lanes)
+    axis = hinged.contiguous().flatten()
+    kept = column, numbers, groups, axis  # alive as long as the function
+
+    def part_of(part: slice):
+        terms = struct()
+        terms.count, terms.hinges = count, int(bool((hinged != 0).any()))
+        terms.column = wp.from_torch(kept[0], dtype=wp.int32)
+        terms.stiffness, terms.free = (wp.from_torch(one) for one in kept[1])
+        terms.axis = wp.from_torch(kept[3])
+        terms.reference, terms.mass = (wp.from_torch(one[part], dtype=types.vec) for one in kept[2])
+        return terms
+
+    return part_of
+
+
 def gauss_newton(
     plan: GaussNewtonPlan, target: Tensor, second: Tensor, offsets: Tensor, relative: Tensor, hips: Tensor,
     threshold: Tensor, *, iterations: int, damping: tuple[float, float, float, float], longest: float,
+    hinge: float, terms: tuple[Mapping[str, Tensor], Tensor] | None = None,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:  # fmt: skip
     """Refined rotations (F, J, 3, 3), Hips (F, 3) [m], accepted steps (F,), last energy change (F,) [m^2].
 
@@ -269,7 +303,8 @@ def gauss_newton(
         offsets: (1 or F, J, 3) [m].
         relative, hips: where to begin.
         threshold: (F,) a frame is done when a step changes its energy by less [m^2].
-        iterations, damping (start, lower, raise, most), longest [rad]: as in the torch twin.
+        iterations, damping (start, lower, raise, most), longest [rad], hinge: as in the torch twin.
+        terms: fields of ``JointTerms``, and the sum of the vertex weights of each frame (F,).
     """
     count, scalar, lanes = len(target), scalar_name(target.dtype), lane_count(target)
     shared = len(second) == 1 and len(offsets) == 1
@@ -282,6 +317,7 @@ def gauss_newton(
         constants = tuple(to_lanes(one, lanes) for one in each)
     outputs = [groups[0].new_empty(len(groups[0]), 1, lanes) for _ in range(2)]
     kernel = _kernel(scalar, lanes, shared=shared)
+    soft = _terms(terms, scalar, lanes, target)
 
     def run(part: slice) -> None:
         size = len(groups[0][part])
@@ -291,7 +327,7 @@ def gauss_newton(
         with launching(target) as device:
             wp.launch(
                 kernel, dim=workers,
-                inputs=[plan.plan, state, iterations, *damping, longest, *numbers,
+                inputs=[plan.plan, state, iterations, *damping, longest, hinge, soft(part), *numbers,
                         *(as_lanes(one[part], types) for one in (*groups, *outputs))],
                 device=device,
             )  # fmt: skip

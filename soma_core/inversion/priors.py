@@ -1,0 +1,206 @@
+"""What is known of a pose besides its vertices: joint limits, hinges, a rest pose, smooth motion."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from soma_core.errors import InputError
+from soma_core.geometry.kabsch import rotation_from_covariance
+from soma_core.geometry.rotations import axis_angle_to_matrix
+
+__all__ = [
+    "HINGES",
+    "JointTerms",
+    "PosePriors",
+    "hinge_rotation",
+    "joint_terms",
+    "neighbour_mean",
+    "with_references",
+]
+
+HINGES: Mapping[str, tuple[float, float, float]] = {
+    "LeftForeArm": (0.0, 1.0, 0.0),
+    "RightForeArm": (0.0, 1.0, 0.0),
+    "LeftShin": (1.0, 0.0, 0.0),
+    "RightShin": (1.0, 0.0, 0.0),
+}
+"""Elbows and knees: joint name -> axis in the world of the T-pose."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class PosePriors:
+    """Soft terms and hinges of a fit; everything is off by default.
+
+    A term of strength s [m/rad] that is off by an angle a costs as much as a root mean square vertex error
+    of ``s a``.
+
+    Attributes:
+        limits: joint name -> largest angle from the T-pose [rad]; beyond it `limit_strength` pulls back.
+        limit_strength: [m/rad].
+        hinges: joint name -> axis in the world of the T-pose; the joint turns about it alone. ``HINGES`` has
+            elbows and knees.
+        rest_strength: pulls every joint towards the T-pose [m/rad].
+        temporal_strength: pulls every joint towards the mean of its neighbours in time [m/rad].
+        temporal_rounds: how often the neighbours are looked at again.
+    """
+
+    limits: Mapping[str, float] = field(default_factory=dict)
+    limit_strength: float = 0.05
+    hinges: Mapping[str, tuple[float, float, float]] = field(default_factory=dict)
+    rest_strength: float = 0.0
+    temporal_strength: float = 0.0
+    temporal_rounds: int = 3
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class JointTerms:
+    """Terms ``stiffness * max(0, angle(R_j R_ref^T) - free)^2``, and hinges.
+
+    Attributes:
+        variable: (q,) position of each term's joint among the variable joints.
+        stiffness: (q,), relative to the sum of vertex weights [m^2/rad^2].
+        free: (q,) [rad].
+        reference: (1 or F, q, 3, 3) T-pose-relative rotations.
+        hinge_axis: (n, 3) unit axis of each variable joint in the world of the T-pose, zero where it is free.
+    """
+
+    variable: Tensor
+    stiffness: Tensor
+    free: Tensor
+    reference: Tensor
+    hinge_axis: Tensor
+
+    def energy(self, rotations: Tensor) -> Tensor:
+        """Sum of the terms (F,) at rotations (F, n, 3, 3) of the variable joints."""
+        _, over, _ = self._deviation(rotations)
+        return (self.stiffness * over * over).sum(1)
+
+    def normal_equations(self, rotations: Tensor, above: Tensor) -> tuple[Tensor, Tensor]:
+        """Gauss-Newton blocks (F, n, 3, 3) and half gradients (F, n, 3) by world turns of the joints.
+
+        Along the arc back a term is quadratic; across it, it curves with the share of the angle that is
+        over, so that the block is never indefinite and is the identity for a term without free range.
+
+        Args:
+            rotations: (F, n, 3, 3) of the variable joints.
+            above: (F, n, 3, 3) world turns of their parents.
+        """
+        axis, over, angle = self._deviation(rotations)
+        world = (above[:, self.variable] @ axis[..., None]).squeeze(-1)
+        share = torch.where(self.free > 0, over / angle.clamp_min(1e-6), torch.ones_like(over))
+        across = self.stiffness * share
+        along = torch.where(over > 0, self.stiffness.expand_as(across), across)
+        eye = torch.eye(3, dtype=rotations.dtype, device=rotations.device)
+        outer = world[..., :, None] * world[..., None, :]
+        block = across[..., None, None] * eye + (along - across)[..., None, None] * outer
+        slope = (self.stiffness * over)[..., None] * world
+        blocks = torch.zeros_like(rotations).index_add(1, self.variable, block)
+        slopes = torch.zeros_like(rotations[..., 0]).index_add(1, self.variable, slope)
+        return blocks, slopes
+
+    def _deviation(self, rotations: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Unit axis (F, q, 3) of ``R_j R_ref^T``, its angle beyond the free one, and its angle (F, q)."""
+        turn = rotations[:, self.variable] @ self.reference.transpose(-1, -2)
+        vee = _vee(turn)
+        length = torch.linalg.vector_norm(vee, dim=-1)
+        angle = torch.atan2(length, turn.diagonal(dim1=-2, dim2=-1).sum(-1) - 1)
+        axis = torch.where(length[..., None] > 1e-12, vee / length[..., None].clamp_min(1e-12), 0.0)
+        return axis, (angle - self.free).clamp_min(0), angle
+
+
+def joint_terms(
+    priors: PosePriors, names: list[str], *, dtype: torch.dtype, device: torch.device
+) -> JointTerms | None:
+    """Terms of `priors` for the variable joints `names`; None where there are none.
+
+    Raises:
+        InputError: a joint that no fit can determine, an axis of no length, a negative strength.
+    """
+    for key in ("limit_strength", "rest_strength", "temporal_strength"):
+        if getattr(priors, key) < 0:
+            raise InputError(f"priors.{key}", got=getattr(priors, key), expected="at least 0", fix="Use 0.")
+    strength = priors.limit_strength
+    rows = [(_find(name, names, "limits"), strength, limit) for name, limit in priors.limits.items()]
+    if priors.rest_strength:
+        rows += [(k, priors.rest_strength, 0.0) for k in range(len(names))]
+    hinges = np.zeros((len(names), 3))
+    for name, axis in priors.hinges.items():
+        length = float(np.linalg.norm(axis))
+        if not length > 0:
+            where = f"priors.hinges[{name!r}]"
+            raise InputError(where, got=tuple(axis), expected="an axis of some length", fix="See HINGES.")
+        hinges[_find(name, names, "hinges")] = np.asarray(axis) / length
+    if not rows and not hinges.any():
+        return None
+    kind = {"dtype": dtype, "device": device}
+    variable, strengths, free = zip(*rows, strict=True) if rows else ((), (), ())
+    return JointTerms(
+        variable=torch.tensor(variable, dtype=torch.int64, device=device),
+        stiffness=torch.tensor(strengths, **kind) ** 2,
+        free=torch.tensor(free, **kind),
+        reference=torch.eye(3, **kind).expand(1, len(rows), 3, 3),
+        hinge_axis=torch.as_tensor(hinges, **kind),
+    )
+
+
+def with_references(terms: JointTerms | None, reference: Tensor, strength: float) -> JointTerms:
+    """Add a pull of every variable joint to rotations of its own in every frame, (F, n, 3, 3)."""
+    frames, count = reference.shape[:2]
+    new = JointTerms(
+        variable=torch.arange(count, device=reference.device),
+        stiffness=reference.new_full((count,), strength**2),
+        free=reference.new_zeros(count),
+        reference=reference,
+        hinge_axis=reference.new_zeros(count, 3),
+    )
+    if terms is None:
+        return new
+    return JointTerms(
+        variable=torch.cat((terms.variable, new.variable)),
+        stiffness=torch.cat((terms.stiffness, new.stiffness)),
+        free=torch.cat((terms.free, new.free)),
+        reference=torch.cat((terms.reference.expand(frames, -1, 3, 3), reference), 1),
+        hinge_axis=terms.hinge_axis,
+    )
+
+
+def neighbour_mean(rotations: Tensor, valid: Tensor) -> Tensor:
+    """Mean of the rotations before and after each frame, (F, n, 3, 3); frames that are not valid have no say.
+
+    A frame without a valid neighbour keeps its own.
+    """
+    weighted = rotations * valid[:, None, None, None].to(rotations)
+    none = torch.zeros_like(rotations[:1])
+    total = torch.cat((none, weighted[:-1])) + torch.cat((weighted[1:], none))
+    alone = (total == 0).all(-1).all(-1)
+    return rotation_from_covariance(torch.where(alone[..., None, None], rotations, total))
+
+
+def _find(name: str, names: list[str], where: str) -> int:
+    if name not in names:
+        raise InputError(
+            f"priors.{where}",
+            got=repr(name),
+            expected="joints that move vertices: " + ", ".join(names[:4]) + ", ...",
+            fix="Take a name from layer.joint_names.",
+        )
+    return names.index(name)
+
+
+def hinge_rotation(rotation: Tensor, axis: Tensor) -> Tensor:
+    """Part of a rotation (..., 3, 3) about an axis (..., 3); rotations about a zero axis stay as they are."""
+    trace = rotation.diagonal(dim1=-2, dim2=-1).sum(-1)
+    angle = 2 * torch.atan2((_vee(rotation) * axis).sum(-1), 1 + trace)
+    free = (axis == 0).all(-1)
+    return torch.where(free[..., None, None], rotation, axis_angle_to_matrix(angle[..., None] * axis))
+
+
+def _vee(m: Tensor) -> Tensor:
+    """Twice the axis times the sine of the angle of rotations (..., 3, 3)."""
+    parts = m[..., 2, 1] - m[..., 1, 2], m[..., 0, 2] - m[..., 2, 0], m[..., 1, 0] - m[..., 0, 1]
+    return torch.stack(parts, -1)
