@@ -42,7 +42,7 @@ def import_silent(context: Context) -> None:
     if output:
         raise CheckFailedError(
             f"import of {context.offer.target}",
-            got=f"the output {output.splitlines()[0]!r:.100}",
+            got=f"the output {output.splitlines()[0]!r:.200}",
             expected="nothing on stdout or stderr, no warnings",
             fix="Take the output out, or use logging inside soma_generator.",
         )

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping, Sequence
+from typing import TypeAlias
+
 import torch
 from torch import Tensor
 
@@ -21,6 +24,12 @@ _SLOPE = 1e-4
 
 _GRADIENT_ENTRIES = 8
 """Entries of a vector whose derivatives are measured."""
+
+_CHUNK = 16
+"""Derivatives measured at a time, to bound memory."""
+
+Pull: TypeAlias = Callable[[Mapping[str, Tensor]], Tensor]
+"""A scalar of each body: parameters (batch, ...) to (batch,)."""
 
 
 def _no_parameters(context: Context) -> str:
@@ -58,9 +67,10 @@ def group_defaults(context: Context) -> None:
     """A parameter of a group that is left out counts as its default."""
     with torch.no_grad():
         default = context.generator.rest(context.default_params())[0]
-    grouped = [item for item in context.parameters if item.group]
-    changes = [Change(item, (0,) * len(item.shape), item.default) for item in grouped]
-    for change in changes:
+        given = context.generator.rest(changed_rows(context.parameters, _kept(context), dtype=torch.float64))
+    if context.metres * (given - default).norm(dim=-1).max() <= _EFFECT_M:
+        return
+    for change in _kept(context):
         rows = changed_rows(context.parameters, [change], dtype=torch.float64)
         with torch.no_grad():
             distance = context.metres * (context.generator.rest(rows)[0] - default).norm(dim=-1)
@@ -73,6 +83,12 @@ def group_defaults(context: Context) -> None:
             )
 
 
+def _kept(context: Context) -> list[Change]:
+    """Each parameter of a group, given at its default."""
+    grouped = [item for item in context.parameters if item.group and 0 not in item.shape]
+    return [Change(item, (0,) * len(item.shape), item.default) for item in grouped]
+
+
 @check("gradient", needs=("batch-invariant", "inputs-unchanged"), unless=_no_parameters)
 def gradient(context: Context) -> None:
     """Bodies are differentiable in every parameter."""
@@ -83,41 +99,50 @@ def gradient(context: Context) -> None:
             generator=torch.Generator(device="cpu").manual_seed(0), dtype=torch.float64, device="cpu",
         )  # fmt: skip
 
-    def pull(params: dict[str, Tensor]) -> Tensor:
+    def pull(params: Mapping[str, Tensor]) -> Tensor:
         return (context.generator.rest(params) * cotangent).flatten(1).sum(1)
 
+    changes = entry_changes(context.parameters, to="far", limit=_GRADIENT_ENTRIES)
+    slopes = _slopes(pull, start)
+    got = torch.stack([slopes[change.parameter.name][change.entry] for change in changes])
+    expected = torch.cat([
+        _differences(pull, start, changes[first : first + _CHUNK]) for first in range(0, len(changes), _CHUNK)
+    ])  # fmt: skip
+    largest = dict.fromkeys(start, 0.0)
+    for change, value in zip(changes, expected.abs().tolist(), strict=True):
+        largest[change.parameter.name] = max(largest[change.parameter.name], value)
+    allowed = _SLOPE * torch.tensor([largest[change.parameter.name] for change in changes])
+    for index in torch.nonzero(~((got - expected).abs() <= allowed)).flatten().tolist():
+        raise CheckFailedError(
+            f"derivative by {str(changes[index]).partition('=')[0]}",
+            got=f"{float(got[index]):.6g}",
+            expected=f"{float(expected[index]):.6g}, the finite difference of a sum of coordinates",
+            fix="Compute in torch from the parameters to the vertices, without detach, .data or NumPy.",
+        )
+
+
+def _slopes(pull: Pull, start: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """Derivative of ``pull`` by each parameter, of the parameter's shape; zero where autograd knows none."""
     leaves = {name: value.clone().requires_grad_() for name, value in start.items()}
     with torch.enable_grad():
-        value = pull({name: leaf * 1 for name, leaf in leaves.items()}).sum()
-        if value.requires_grad:
-            value.backward()
-    for item in context.parameters:
-        found = torch.zeros(item.shape, dtype=torch.float64)
-        if leaves[item.name].grad is not None:
-            found = leaves[item.name].grad[0]
-        if not found.numel():
-            continue
-        entries = [change.entry for change in entry_changes([item], to="far", limit=_GRADIENT_ENTRIES)]
-        step = _STEP * (item.range[1] - item.range[0])
-        rows = {
-            name: value.repeat(2 * len(entries), *[1] * (value.ndim - 1)) for name, value in start.items()
-        }
-        for index, entry in enumerate(entries):
-            rows[item.name][(2 * index, *entry)] += step
-            rows[item.name][(2 * index + 1, *entry)] -= step
-        with torch.no_grad():
-            ends = pull(rows)
-        expected = (ends[0::2] - ends[1::2]) / (2 * step)
-        got = torch.stack([found[entry] for entry in entries])
-        error = (got - expected).abs()
-        if not error.max() <= _SLOPE * expected.abs().max():
-            worst = int(error.argmax())
-            raise CheckFailedError(
-                f"derivative by {str(Change(item, entries[worst], 0)).partition('=')[0]}",
-                got=f"{float(got[worst]):.6g}",
-                expected=f"{float(expected[worst]):.6g}, the finite difference of a sum of coordinates",
-                fix="Compute in torch from the parameters to the vertices, without detach, .data or NumPy.",
-            )
+        total = pull({name: leaf * 1 for name, leaf in leaves.items()}).sum()
+        if total.requires_grad:
+            total.backward()
+    return {
+        name: (torch.zeros_like(leaf) if leaf.grad is None else leaf.grad)[0] for name, leaf in leaves.items()
+    }
+
+
+def _differences(pull: Pull, start: Mapping[str, Tensor], changes: Sequence[Change]) -> Tensor:
+    """Central finite differences of ``pull`` by the entries that `changes` name."""
+    rows = {name: value.repeat(2 * len(changes), *[1] * (value.ndim - 1)) for name, value in start.items()}
+    steps = [_STEP * (change.parameter.range[1] - change.parameter.range[0]) for change in changes]
+    for index, (change, step) in enumerate(zip(changes, steps, strict=True)):
+        rows[change.parameter.name][(2 * index, *change.entry)] += step
+        rows[change.parameter.name][(2 * index + 1, *change.entry)] -= step
+    with torch.no_grad():
+        ends = pull(rows)
+    return (ends[0::2] - ends[1::2]) / (2 * torch.tensor(steps, dtype=ends.dtype))
 
 
 CHECKS = (parameters, group_defaults, gradient)

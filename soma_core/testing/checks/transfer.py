@@ -78,7 +78,7 @@ def _refuse_uncovered(context: Context, native: np.ndarray, body: np.ndarray) ->
         )
 
 
-@check("transfer-random", needs=("stature",))
+@check("transfer-random", level="core", needs=("stature",))
 def transfer_random(context: Context) -> None:
     """Random bodies keep the neighbourhoods of the default body."""
     start, end = canonical_edges(context.mesh)

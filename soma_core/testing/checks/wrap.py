@@ -79,8 +79,8 @@ def wrap_distance(context: Context) -> None:
     if astray > _ASTRAY or distance[worst] > _LOOSE * diagonal:
         raise CheckFailedError(
             f"wrap {context.spec.wrap.wrap}, {context.vertex(worst)}",
-            got=f"{millimetres * distance[worst]:.0f} mm to the native surface, and {astray:.1%} of the vertices "
-            f"further than {millimetres * _CLOSE * diagonal:.0f} mm",
+            got=f"{millimetres * distance[worst]:.0f} mm to the native surface, and {astray:.1%} of the "
+            f"vertices further than {millimetres * _CLOSE * diagonal:.0f} mm",
             expected=f"at most {millimetres * _LOOSE * diagonal:.0f} mm, and {_ASTRAY:.0%}",
             fix="Register the wrap again, or name the segment in fill_segments if the model lacks it.",
         )

@@ -1,0 +1,11 @@
+"""What every backend must hold, without and with the local changes."""
+
+from soma_core.testing import conformance_suite
+
+TestAnny = conformance_suite("anny")
+
+TestAnnyLocalChanges = conformance_suite(
+    "anny",
+    {"parameters": "nipple-point-incr moves only vertices that Anny's topology leaves out"},
+    options={"local_changes": "all"},
+)
