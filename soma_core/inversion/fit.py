@@ -16,6 +16,7 @@ from soma_core.inversion._inputs import check_vertices, check_weights, refuse_un
 from soma_core.inversion.analytical import AnalyticalOptions
 from soma_core.inversion.autograd import AutogradOptions
 from soma_core.inversion.comparison import compare, part_of
+from soma_core.inversion.implicit import attach_gradient
 from soma_core.inversion.ladder import Ladder, LadderOptions, Stage
 from soma_core.inversion.moments import RestMoments, SkinMoments
 from soma_core.inversion.priors import PosePriors, joint_terms, neighbour_mean, with_references
@@ -123,7 +124,6 @@ class PoseInversion(torch.nn.Module):
         offsets = self.layer.animation.kinematics.local_offsets(identity.bind_world)
         return self.moments.rest(identity, weights, offsets)
 
-    @torch.no_grad()
     def forward(
         self,
         vertices: Tensor,
@@ -146,11 +146,51 @@ class PoseInversion(torch.nn.Module):
             bone_scale: (1 or F, J - 1) known factors of the bone vectors, as in ``SomaLayer.pose``.
             initial: an earlier result for these frames, in place of the starting stages.
 
+        Returns:
+            Rotations and translation carry gradients by `vertices` (the implicit derivative of the
+            minimum: exact where the fit is, Gauss-Newton elsewhere); the report does not.
+
         Raises:
             InputError: a wrong shape, a negative weight or bone scale, or vertices in another unit than they
-                should be.
+                should be; a gradient asked for with `robust` or a temporal prior.
         """
-        vertices = self._canonical(vertices, topology)
+        canonical = self._canonical(vertices, topology)
+        with torch.no_grad():
+            frames = self._frames(canonical.detach(), identity, weights, bone_scale, initial)
+            result = self._fit_all(frames)
+            strength = self.priors.temporal_strength
+            for _ in range(self.priors.temporal_rounds if strength else 0):
+                variables = result.rotations[:, self.ladder.solver.variables - 1]
+                reference = neighbour_mean(variables, result.valid)
+                result = self._fit_all(replace(frames, initial=result, reference=reference))
+        if not (torch.is_grad_enabled() and canonical.requires_grad):
+            return result
+        return self._with_gradient(canonical, frames, result)
+
+    def _with_gradient(self, vertices: Tensor, frames: _Frames, result: InversionResult) -> InversionResult:
+        if self.ladder.options.robust is not None or self.priors.temporal_strength:
+            raise InputError(
+                "vertices",
+                got="a tensor that requires a gradient",
+                expected="none with robust or temporal terms, whose fit has no derivative here",
+                fix="Pass vertices.detach(), or leave out robust and temporal_strength.",
+            )
+        rotations, translation = attach_gradient(
+            vertices, result.rotations, result.translation, solver=self.ladder.solver, moments=self.moments,
+            identity=frames.identity, weights=frames.weights, valid=result.valid, terms=self.terms,
+            offsets=self.layer.animation.bone_vectors(frames.identity, frames.bone_scale),
+        )  # fmt: skip
+        return replace(result, rotations=rotations, translation=translation)
+
+    def _frames(
+        self,
+        vertices: Tensor,
+        identity: Identity,
+        weights: Tensor | None,
+        bone_scale: Tensor | None,
+        initial: InversionResult | None,
+    ) -> _Frames:
+        """Check what belongs to the frames, and bring it together."""
         count = len(vertices)
         if identity.batch_size not in (1, count):
             raise InputError(
@@ -163,17 +203,10 @@ class PoseInversion(torch.nn.Module):
         user_joints = self.layer.rig.joint_count - 1
         bone_scale = check_bone_scale(bone_scale, count, user_joints, self.layer.dtype, self.layer.device)
         shared = identity.batch_size == 1 and len(weights) == 1
-        frames = _Frames(
+        return _Frames(
             vertices=vertices, identity=identity, weights=weights, bone_scale=bone_scale, initial=initial,
             rest=self.prepare(identity, weights) if shared else None,
         )  # fmt: skip
-        result = self._fit_all(frames)
-        strength = self.priors.temporal_strength
-        for _ in range(self.priors.temporal_rounds if strength else 0):
-            variables = result.rotations[:, self.ladder.solver.variables - 1]
-            reference = neighbour_mean(variables, result.valid)
-            result = self._fit_all(replace(frames, initial=result, reference=reference))
-        return result
 
     def _fit_all(self, frames: _Frames) -> InversionResult:
         """Fit chunk by chunk."""

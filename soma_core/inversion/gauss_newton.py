@@ -109,7 +109,7 @@ class GaussNewton(torch.nn.Module):
         for _ in range(iterations):
             matrix, slope = self.normal_equations(turns, places, rest.second, residual)
             if terms is not None:
-                self._add_terms(matrix, slope, pose.relative, turns, terms, mass)
+                self.add_terms(matrix, slope, pose.relative, turns, terms, mass)
             step = self._solve(matrix, slope, damping)
             if terms is not None:
                 step = self._along_hinges(step, turns, terms)
@@ -138,7 +138,7 @@ class GaussNewton(torch.nn.Module):
             damping = (damping * torch.where(better, _LOWER, _RAISE).to(damping)).clamp_max(_MOST_DAMPING)
         return pose
 
-    def _add_terms(
+    def add_terms(
         self, matrix: Tensor, slope: Tensor, relative: Tensor, turns: Tensor, terms: JointTerms, mass: Tensor
     ) -> None:
         """Add the terms to the normal equations, and make turns of hinges off their axis too costly."""
@@ -209,6 +209,14 @@ class GaussNewton(torch.nn.Module):
                 step = (turns[:, above] @ offsets[:, level, :, None]).squeeze(-1)
                 places[:, level] = places[:, above] + step
         return turns, places
+
+    def down_the_tree(self, own: Tensor) -> Tensor:
+        """Sums (F, J, 3) of each joint's value and those of all joints above it."""
+        total = own.clone()
+        for index in range(self.level_count):
+            level = getattr(self, f"level_{index}")
+            total[:, level] += total[:, self.parents[level]]
+        return total
 
     def times_second(self, transforms: Tensor, second: Tensor) -> Tensor:
         """``G N`` for (F, T, 3, 4) rows and dense ``N`` (i, 4 T, 4 T)."""

@@ -72,6 +72,7 @@ class SkinMoments(torch.nn.Module):
     ) -> None:
         super().__init__()
         self.dtype, self.joint_count, self.warp = dtype, len(structure.joints), warp
+        self.vertex_count = len(structure.fitted)
         orient = rig.t_pose_world[structure.joints, :3, :3]
 
         def keep(name: str, array: np.ndarray) -> None:
