@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import contextlib
 import json
+import shlex
 import sys
 from collections.abc import Callable, Sequence
 from dataclasses import asdict
@@ -136,7 +137,7 @@ def _new(options: argparse.Namespace) -> tuple[str, int]:
 
     folder = write_backend(options.name, options.output)
     commands = [
-        f"pip install -e {folder}",
+        f"pip install -e {shlex.quote(str(folder))}",
         f"soma backends check {options.name}",
         f"soma animate backend={options.name}",
     ]

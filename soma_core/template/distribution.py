@@ -48,7 +48,7 @@ def write_backend(name: str, folder: Path | str = ".", *, registry: Registry | N
         registry: whose backends' names are taken; by default what is installed.
 
     Raises:
-        InputError: a name that will not do or is taken, or a folder that exists.
+        InputError: a name that will not do or is taken, a folder that exists or cannot be written.
     """
     _check_name(name, registry or default_registry())
     distribution = f"soma-backend-{name.replace('_', '-')}"
@@ -58,13 +58,24 @@ def write_backend(name: str, folder: Path | str = ".", *, registry: Registry | N
             "folder", got=str(target), expected="a folder that does not exist yet",
             fix="Remove it, or write the backend elsewhere.",
         )  # fmt: skip
+    try:
+        _write(target, name)
+    except OSError as error:
+        raise InputError(
+            "folder", got=f"{folder} ({error.strerror})", expected="a folder to write into",
+            fix="Write the backend elsewhere.",
+        ) from error  # fmt: skip
+    return target
+
+
+def _write(target: Path, name: str) -> None:
+    """Write everything beside `target`, then move it there."""
     target.parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(dir=target.parent, prefix=f".{distribution}-") as temporary:
-        made = Path(temporary) / distribution
-        _write_texts(made, name, distribution)
+    with tempfile.TemporaryDirectory(dir=target.parent, prefix=f".{target.name}-") as temporary:
+        made = Path(temporary) / target.name
+        _write_texts(made, name, target.name)
         _write_model(made / f"soma_backend_{name}")
         shutil.move(made, target)
-    return target
 
 
 def _check_name(name: str, registry: Registry) -> None:

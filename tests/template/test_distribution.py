@@ -154,12 +154,18 @@ def test_a_folder_that_exists_is_left_alone(tmp_path):
 
 def test_a_failure_leaves_nothing_behind(tmp_path, monkeypatch):
     def fail(folder):
-        raise OSError("disk full")
+        raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(distribution, "_write_model", fail)
-    with pytest.raises(OSError, match="disk full"):
+    with pytest.raises(InputError, match=r"folder: got .* \(No space left on device\), expected a folder to"):
         write_backend("acme", tmp_path, registry=NOBODY)
     assert not list(tmp_path.iterdir())
+
+
+def test_a_file_in_the_way_is_named(tmp_path):
+    (tmp_path / "file").touch()
+    with pytest.raises(InputError, match=r"folder: got .*/file \(File exists\), expected a folder to write"):
+        write_backend("acme", tmp_path / "file", registry=NOBODY)
 
 
 def test_the_folder_above_is_made(tmp_path):
