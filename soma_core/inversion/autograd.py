@@ -1,8 +1,9 @@
 """Gradient descent through the forward model: Adam on rotations in 6D (paper, section 3.6).
 
-The 6D parametrisation is that of Zhou et al., "On the continuity of rotation representations", CVPR 2019. What
-descends is the turn of each joint from the T-pose to the world, not from its parent: a step of the spine then
-carries the arms along without turning them, and a hundred steps reach the optimum that local rotations miss.
+The 6D parametrisation is that of Zhou et al., "On the continuity of rotation representations", CVPR 2019.
+What descends is the turn of each joint from the T-pose to the world, not from its parent: a step of the spine
+then carries the arms along without turning them, and a hundred steps reach the optimum, which local rotations
+do not.
 """
 
 from __future__ import annotations
