@@ -118,6 +118,8 @@ def from_lanes(groups: Tensor, count: int, shape: tuple[int, ...]) -> Tensor:
 def as_lanes(groups: Tensor, types: SimpleNamespace) -> wp.array:
     """Descriptor of (groups, k, lanes) memory as a two-dimensional array of lane vectors."""
     assert groups.is_contiguous(), groups.stride()
+    rows, lanes = groups.shape[1:]
+    groups = groups.as_strided(groups.shape, (rows * lanes, lanes, 1))  # of one lane the stride may be any
     return wp.from_torch(groups, dtype=types.vec, requires_grad=False, return_ctype=True)
 
 
@@ -127,6 +129,8 @@ def in_threads(run: Callable[[slice], None], count: int, like: Tensor) -> None:
     Warp runs a CPU kernel on the calling thread and lets go of the interpreter meanwhile. On a GPU there is
     one part.
     """
+    if not count:
+        return
     threads = 1 if like.is_cuda else min(torch.get_num_threads(), count)
     bounds = np.linspace(0, count, threads + 1).astype(int)
     parts = [slice(int(a), int(b)) for a, b in itertools.pairwise(bounds)]
