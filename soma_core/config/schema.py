@@ -10,7 +10,9 @@ from hydra.core.config_store import ConfigStore
 from omegaconf import MISSING
 
 __all__ = [
+    "AnalyticalChoice",
     "AnimateConfig",
+    "AutogradChoice",
     "BackendChoice",
     "BenchConfig",
     "EvaluateConfig",
@@ -23,6 +25,7 @@ __all__ = [
     "LengthUnit",
     "Lod",
     "Picture",
+    "PriorChoice",
     "Product",
     "Topology",
     "TrainShapeConfig",
@@ -139,12 +142,50 @@ class AnimateConfig:
 
 
 @dataclass
+class AnalyticalChoice:
+    """Sweeps of the stage ``analytical`` over all but the fingers, the fingers, and everything."""
+
+    body: int = 2
+    fingers: int = 0
+    full: int = 1
+
+
+@dataclass
+class AutogradChoice:
+    """Stage ``autograd``: steps, learning rates [rad, m], how far they fall, factors of regions, the loss."""
+
+    iterations: int = 100
+    rate: float = 0.02
+    shift_rate: float = 0.002
+    final: float = 0.02
+    regions: dict[str, float] = field(default_factory=dict)
+    loss: str = "moments"
+
+
+@dataclass
+class PriorChoice:
+    """Soft terms [m/rad]: limits of joints [rad], a rest pose, smooth motion; hinges: elbows and knees."""
+
+    limits: dict[str, float] = field(default_factory=dict)
+    limit_strength: float = 0.05
+    hinges: bool = False
+    rest_strength: float = 0.0
+    temporal_strength: float = 0.0
+    temporal_rounds: int = 3
+
+
+@dataclass
 class InversionChoice:
-    """How poses are found: stages in order, most iterations of the last, when they end [rad], kernels."""
+    """How poses are found: the stages in their order, and what each of them takes."""
 
     stages: list[str] = field(default_factory=lambda: ["procrustes", "gauss_newton"])
-    iterations: int = 10
-    tolerance: float = 1e-5
+    iterations: int = 20
+    tolerance: float = 2e-5
+    robust: float | None = None
+    robust_rounds: int = 10
+    analytical: AnalyticalChoice = field(default_factory=AnalyticalChoice)
+    autograd: AutogradChoice = field(default_factory=AutogradChoice)
+    priors: PriorChoice = field(default_factory=PriorChoice)
     kernels: Kernels = Kernels.auto
 
 

@@ -11,15 +11,17 @@ import numpy as np
 import torch
 from omegaconf import OmegaConf
 
+from soma_core.config.schema import InversionChoice
 from soma_core.errors import InputError
 from soma_core.evaluation.inversion_sequences import MovingMesh
 from soma_core.inversion import InversionResult, PoseInversion
+from soma_core.inversion.options import inversion_options
 from soma_core.inversion.report import InversionReport
 from soma_core.layer import SomaLayer
 from soma_core.paths import configs_dir
 from soma_core.progress import progress
 
-__all__ = ["DEFAULT_METHOD", "MethodRun", "joint_angle_errors", "run_methods"]
+__all__ = ["DEFAULT_METHOD", "MethodRun", "joint_angle_errors", "method_options", "run_methods"]
 
 DEFAULT_METHOD = "gauss_newton"
 """The method that bounds are held against; it is the default of ``soma invert``."""
@@ -84,7 +86,7 @@ def run_methods(
     shown = DEFAULT_METHOD if DEFAULT_METHOD in methods else methods[-1]
     together, each = {}, []
     for method in progress(methods, label="method", total=len(methods), after=5.0):
-        choice = _choice(method)
+        choice = method_options(method)
         runs = [_Run(mesh, layers[mesh.backend], choice) for mesh in meshes]
         together[method] = _gathered(runs, method, "all")
         if method == shown:
@@ -92,15 +94,21 @@ def run_methods(
     return together, each
 
 
-def _choice(method: str) -> dict[str, Any]:
-    """Options of ``PoseInversion`` under the name that the command line gives them."""
+def method_options(method: str) -> dict[str, Any]:
+    """Options of ``PoseInversion`` under the name that the command line gives them.
+
+    Raises:
+        InputError: no config ``inversion/<method>`` exists.
+    """
     path = configs_dir() / "inversion" / f"{method}.yaml"
     if not path.is_file():
         known = ", ".join(sorted(file.stem for file in path.parent.glob("*.yaml")))
         raise InputError(
             "experiment.methods", got=repr(method), expected=f"among {known}", fix="Correct the name."
         )
-    return dict(OmegaConf.to_container(OmegaConf.load(path)))
+    choice = OmegaConf.merge(OmegaConf.structured(InversionChoice), OmegaConf.load(path))
+    values = OmegaConf.to_container(choice, enum_to_str=True)
+    return inversion_options(values)
 
 
 class _Run:

@@ -12,10 +12,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
+from omegaconf import OmegaConf
 
 from soma_core.cache import atomic_write
 from soma_core.errors import InputError
 from soma_core.inversion import PoseInversion
+from soma_core.inversion.options import inversion_options
 from soma_core.io.motion_files import write_motion_parts
 from soma_core.io.vertex_files import open_vertex_sequence
 from soma_core.io.vertex_sequence import VertexSequence
@@ -29,6 +31,7 @@ from soma_core.tasks.posed_input import PosedInput
 if TYPE_CHECKING:
     from omegaconf import DictConfig
 
+    from soma_core.inversion.priors import PosePriors
     from soma_core.skeleton.identity import Identity
 
 __all__ = ["run"]
@@ -114,9 +117,7 @@ def _prepare(config: DictConfig, sequence: VertexSequence, output: Path) -> _Job
         "params": params,
         "options": options,
         "lod": layer.mesh.lod,
-        "stages": list(config.inversion.stages),
-        "iterations": config.inversion.iterations,
-        "tolerance": config.inversion.tolerance,
+        "inversion": _fit_settings(config),
         "rig": layer.rig.revision,
     }
     made_from = {**settings, "content": _fingerprint(sequence.path), "shown": config.picture.frames}
@@ -129,6 +130,12 @@ def _prepare(config: DictConfig, sequence: VertexSequence, output: Path) -> _Job
         config=config, layer=layer, params=params, identity=identity, posed=posed, chunks=chunks,
         settings=settings,
     )  # fmt: skip
+
+
+def _fit_settings(config: DictConfig) -> dict[str, Any]:
+    """Everything in the group ``inversion`` that decides the result; kernels only round differently."""
+    values = OmegaConf.to_container(config.inversion, resolve=True)
+    return {str(name): value for name, value in values.items() if name != "kernels"}
 
 
 def _fingerprint(path: Path) -> str:
@@ -147,20 +154,22 @@ def _fit_missing(job: _Job) -> None:
     done = total - len(missing)
     if done:
         _log.info("going on after %d of %d chunks", done, total)
-    choice, layer = job.config.inversion, job.layer
-    inversion = PoseInversion(
-        layer,
-        stages=tuple(choice.stages),
-        iterations=choice.iterations,
-        tolerance=choice.tolerance,
-        kernels=str(choice.kernels),
-    )
+    layer, options = job.layer, inversion_options(job.settings["inversion"])
+    inversion = PoseInversion(layer, **options, kernels=str(job.config.inversion.kernels))
+    margin = _margin(options["priors"])
     kept = -(-job.config.picture.frames // total)
     for number in progress(missing, label="chunk", total=total, done=done, after=5.0):
         start, stop = job.chunks.ranges[number]
-        vertices = torch.as_tensor(job.posed.read(start, stop)).to(layer.device, layer.dtype)
+        begin, end = max(start - margin, 0), min(stop + margin, job.chunks.frame_count)
+        vertices = torch.as_tensor(job.posed.read(begin, end)).to(layer.device, layer.dtype)
         result = inversion(vertices, job.identity, topology=job.posed.topology)
+        result = result.part(slice(start - begin, stop - begin))
         job.chunks.save(number, chunk_arrays(result, layer, start=start, kept=kept, apart=job.apart))
+
+
+def _margin(priors: PosePriors) -> int:
+    """Frames on either side of a chunk that a prior on neighbours looks at: one further a round."""
+    return priors.temporal_rounds + 1 if priors.temporal_strength else 0
 
 
 def _write_results(job: _Job, output: Path) -> None:

@@ -259,3 +259,25 @@ def test_from_the_command_line(source, tmp_path, monkeypatch, capsys):
     assert streams.out.splitlines()[-1] == "out"
     assert "body.npz: 8 frames of 4505 vertices (canonical) at 24 fps" in streams.err
     assert "8 frames, 0 of them unusable; converged 100.0%" in streams.err
+
+
+def test_a_prior_on_neighbours_sees_across_chunks(layer, source, tmp_path):
+    smooth = {"inversion": {"priors": {"temporal_strength": 0.05}}}
+    invert.run(configured(input=str(source), **smooth), tmp_path / "whole")
+    invert.run(configured(input=str(source), chunk=2, **smooth), tmp_path / "parts")
+    invert.run(configured(input=str(source)), tmp_path / "free")
+    whole, parts, free = (reposed(layer, tmp_path / name) for name in ("whole", "parts", "free"))
+    assert np.abs(whole - parts).max() < CHUNK_TOLERANCE
+    assert np.abs(whole - free).max() > 100 * CHUNK_TOLERANCE
+
+
+@pytest.mark.parametrize("method", ["transfer", "analytical", "autograd", "analytical_autograd"])
+def test_the_papers_methods_run_from_the_command_line(source, tmp_path, monkeypatch, capsys, method):
+    monkeypatch.chdir(tmp_path)
+    command = ["invert", f"input={source}", "fps=24", "unit=m", "topology=canonical", "lod=low",
+               "backend.params.shape=[1.0,-0.5]", "picture.frames=0", f"inversion={method}",
+               "inversion.autograd.iterations=3", "hydra.run.dir=out"]  # fmt: skip
+    assert main(command) == EXIT_OK
+    report = json.loads((tmp_path / "out/report.json").read_text(encoding="utf-8"))
+    assert report["settings"]["inversion"]["stages"][0] == "transfer"
+    assert ROUND_TRIP_MM < report["error_mm"]["all"]["mean"] < 15
