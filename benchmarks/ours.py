@@ -1,4 +1,8 @@
-"""Worker: this project. ``python benchmarks/ours.py BACKEND [DEVICE]``"""
+"""Worker: this project.
+
+python benchmarks/ours.py BACKEND [DEVICE]       the forward path
+python benchmarks/ours.py inversion [DEVICE]     pose inversion
+"""
 
 from __future__ import annotations
 
@@ -9,7 +13,7 @@ import time
 import numpy as np
 import torch
 from inputs import PHENOTYPES
-from worker import Call, serve
+from worker import Call, Work, serve
 
 from soma_core.layer import SomaLayer
 
@@ -58,5 +62,48 @@ def _waited(vertices: torch.Tensor) -> torch.Tensor:
     return vertices
 
 
+def main_inversion(device: str = "cpu") -> None:
+    from soma_core.evaluation.inversion_runs import method_options
+    from soma_core.inversion import PoseInversion
+
+    torch.set_num_threads(2)
+    layers = {lod: SomaLayer("anny", lod=lod, device=device) for lod in ("mid", "low")}
+
+    @torch.no_grad()
+    def prepare(case: str, inputs: dict[str, np.ndarray]) -> Work:
+        lod, method = case.split("/")
+        values = inputs["phenotypes"][0].tolist()
+        params = dict(zip(PHENOTYPES, values, strict=True))
+        layer, inversion = layers[lod], PoseInversion(layers[lod], **method_options(method))
+        identity = layer.identity(params)
+        if "vertices" in inputs:
+            judge, target = layers["mid"], torch.from_numpy(inputs["vertices"]).to(device)
+            given = target[:, torch.as_tensor(layer.mesh.mid_ids.astype(np.int64))].contiguous()
+        else:
+            judge = layer
+            poses, shift = (torch.from_numpy(inputs[name]).to(device) for name in ("poses", "translation"))
+            given = target = layer.pose(identity, poses, shift).vertices.contiguous()
+
+        @torch.no_grad()
+        def array(result) -> np.ndarray:
+            posed = judge.pose(judge.identity(params), result.rotations, result.translation)
+            return torch.stack([posed.vertices, target]).cpu().numpy()
+
+        def call():
+            result = inversion(given, identity)
+            _waited(result.residual)
+            return result
+
+        return Work(torch.no_grad()(call), array)
+
+    serve(prepare, {
+        "implementation": "soma_core", "soma-body-core": importlib.metadata.version("soma-body-core"),
+        "torch": torch.__version__,
+    })  # fmt: skip
+
+
 if __name__ == "__main__":
-    main(*sys.argv[1:])
+    if sys.argv[1] == "inversion":
+        main_inversion(*sys.argv[2:])
+    else:
+        main(*sys.argv[1:])

@@ -5,6 +5,7 @@ layout, so that both run on the same rig, mesh and shape space.
 
     python benchmarks/peers.py build FOLDER          make the peer's assets (in this project's environment)
     python benchmarks/peers.py py-soma-x FOLDER BACKEND      worker (in the peer's environment)
+    python benchmarks/peers.py py-soma-x-inversion FOLDER    worker: pose inversion (there too)
     python benchmarks/peers.py anny                          worker: the anny package's own SOMA rig
 """
 
@@ -80,13 +81,7 @@ def serve_py_soma_x(folder: str, backend: str) -> None:
     scales = {} if backend == "anny" else None
 
     def coefficients(inputs: dict[str, np.ndarray]) -> torch.Tensor:
-        if backend == "soma":
-            return torch.from_numpy(inputs["shape"])
-        labels = list(layer.identity_model.identity_model.anny_model.phenotype_labels)
-        values = torch.full((len(inputs["phenotypes"]), len(labels)), 0.5)
-        for index, name in enumerate(PHENOTYPES):
-            values[:, labels.index(name)] = torch.from_numpy(inputs["phenotypes"][:, index])
-        return values
+        return torch.from_numpy(inputs["shape"]) if backend == "soma" else _phenotypes(layer, inputs)
 
     def prepare(case, inputs):
         poses, shift = torch.from_numpy(inputs["poses"]), torch.from_numpy(inputs["translation"])
@@ -113,6 +108,77 @@ def serve_py_soma_x(folder: str, backend: str) -> None:
             return vertices.detach()
 
         return both
+
+    versions = {name: importlib.metadata.version(name) for name in ("py-soma-x", "torch", "warp-lang")}
+    serve(prepare, {"implementation": "py-soma-x", **versions})
+
+
+def _phenotypes(layer, inputs: dict[str, np.ndarray]):
+    """Anny's parameters in the order of the peer's model; those that are not given stay in the middle."""
+    import torch
+
+    labels = list(layer.identity_model.identity_model.anny_model.phenotype_labels)
+    values = torch.full((len(inputs["phenotypes"]), len(labels)), 0.5)
+    for index, name in enumerate(PHENOTYPES):
+        values[:, labels.index(name)] = torch.from_numpy(inputs["phenotypes"][:, index])
+    return values
+
+
+INVERSIONS = {
+    "analytical": {"body_iters": 2, "full_iters": 1},
+    "autograd": {"body_iters": 0, "full_iters": 0, "autograd_iters": 100},
+    "analytical_autograd": {"body_iters": 2, "full_iters": 1, "autograd_iters": 100},
+}
+"""Settings of the paper's rows; its first row, the skeleton transfer, is not among what ``fit`` offers."""
+
+
+def _skeleton_transfer(inversion, vertices, parents: np.ndarray) -> dict:
+    """Local rotations (frames, J, 3, 3) and Hips positions from the peer's skeleton fit alone."""
+    world = inversion._skel_transfer.fit(vertices)
+    turns = world[..., :3, :3]
+    local = turns[:, parents].transpose(-1, -2) @ turns
+    local[:, 1] = turns[:, 1]  # Root, which is virtual, does not turn
+    return {"rotations": local, "root_translation": world[:, 1, :3, 3]}
+
+
+def serve_py_soma_x_inversion(folder: str) -> None:
+    import torch
+    from soma import SOMALayer
+    from soma.pose_inversion import PoseInversion
+    from worker import Work, serve
+
+    torch.set_num_threads(2)
+    layer = SOMALayer(Path(folder), device="cpu", identity_model_type="anny", mode="warp")
+    with np.load(Path(folder) / "SOMA_neutral.npz", allow_pickle=False) as file:
+        low, parents = torch.from_numpy(file["lod_mid_to_low"]).long(), file["joint_parent_ids"]
+
+    def prepare(case, inputs):
+        lod, method = case.split("/")
+        given, own = _phenotypes(layer, inputs), "vertices" not in inputs
+
+        def pose(rotations, shift, **options):
+            layer.prepare_identity(given, {}, repose_to_bind_pose=own)
+            return layer.pose(rotations, transl=shift, apply_correctives=False, **options)["vertices"]
+
+        with torch.no_grad():
+            if own:
+                target = pose(torch.from_numpy(inputs["poses"]), torch.from_numpy(inputs["translation"]))
+            else:
+                target = torch.from_numpy(inputs["vertices"])
+        seen = target[:, low].contiguous() if lod == "low" else target
+        # One that has served another identity gives wrong answers.
+        inversion = PoseInversion(layer, low_lod=lod == "low")
+        inversion.prepare_identity(given, {}, repose_to_bind_pose=own)
+
+        @torch.no_grad()
+        def array(found):
+            rotations, shift = found["rotations"].detach(), found["root_translation"].detach()
+            posed = pose(rotations[:, 1:], shift, pose2rot=False, absolute_pose=True)
+            return torch.stack([posed, target]).numpy()
+
+        if method == "skeleton_transfer":
+            return Work(torch.no_grad()(lambda: _skeleton_transfer(inversion, seen, parents)), array)
+        return Work(lambda: inversion.fit(seen, **INVERSIONS[method]), array)
 
     versions = {name: importlib.metadata.version(name) for name in ("py-soma-x", "torch", "warp-lang")}
     serve(prepare, {"implementation": "py-soma-x", **versions})
@@ -153,6 +219,8 @@ if __name__ == "__main__":
         build(Path(rest[0]))
     elif verb == "py-soma-x":
         serve_py_soma_x(*rest)
+    elif verb == "py-soma-x-inversion":
+        serve_py_soma_x_inversion(*rest)
     elif verb == "anny":
         serve_anny()
     else:

@@ -1,18 +1,18 @@
-"""Time the forward path against its peers: correctness first, then alternating rounds, then the tables.
+"""Time the forward path and pose inversion against their peers: correctness first, then alternating rounds.
 
     python -m venv peer
     peer/bin/pip install torch==2.13.0
     peer/bin/pip install py-soma-x==0.1.0 anny==0.6.2
     python benchmarks/run.py --peer-python peer/bin/python
 
-Writes ``benchmarks/results/forward_cpu.json`` and the tables in ``benchmarks/README.md`` and ``README.md``.
+Writes ``forward_cpu.json`` and ``inversion_cpu.json`` in ``benchmarks/results``, and the tables in
+``benchmarks/README.md`` and ``README.md``.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
-import platform
 import re
 import statistics
 import subprocess
@@ -23,10 +23,9 @@ from pathlib import Path
 
 import numpy as np
 from inputs import forward_inputs
+from inversion import inversion_table, run_inversion
+from processes import HERE, ROOT, Worker, cpu_name, medians_of_rounds, short_commit
 
-HERE = Path(__file__).resolve().parent
-ROOT = HERE.parent
-MARKS = ("<!-- benchmarks:begin -->", "<!-- benchmarks:end -->")
 SAME_MM = {"soma": 5.0, "anny": 5.0}
 """Largest mean distance to the peer [mm] at which the work counts as the same. Different frames of joints
 with several children, and our reposing to the bind pose, account for about one (see the experiment
@@ -39,35 +38,6 @@ BARS = {
     ("soma", "pose", 32): 4, ("soma", "pose", 128): 4, ("anny", "pose", 32): 4, ("anny", "pose", 128): 4,
     ("soma", "forward_backward", 8): 2, ("anny", "forward_backward", 8): 2,
 }  # fmt: skip
-
-
-class Worker:
-    """One implementation in a process of its own."""
-
-    def __init__(self, name: str, command: Sequence[str]) -> None:
-        self.name = name
-        self.process = subprocess.Popen(
-            command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, cwd=HERE
-        )
-        self.versions = self._read()["versions"]
-        self.peak_mb = 0.0
-
-    def _read(self) -> dict:
-        for line in self.process.stdout:
-            if line.startswith("{"):  # libraries greet on stdout while they are imported
-                return json.loads(line)
-        raise SystemExit(f"{self.name} ended; its own message is above")
-
-    def ask(self, **request: object) -> dict:
-        self.process.stdin.write(json.dumps(request) + "\n")
-        self.process.stdin.flush()
-        reply = self._read()
-        self.peak_mb = max(self.peak_mb, reply.get("peak_mb", 0.0))
-        return reply
-
-    def close(self) -> None:
-        self.process.stdin.close()
-        self.process.wait()
 
 
 def compare(ours: Worker, peer: Worker, inputs: str, folder: Path, *, limit_mm: float, hips: bool) -> float:
@@ -86,18 +56,6 @@ def compare(ours: Worker, peer: Worker, inputs: str, folder: Path, *, limit_mm: 
             f"{ours.name} and {peer.name} are {distance:.1f} mm apart: not the same work, not timed"
         )
     return distance
-
-
-def measure(
-    workers: list[Worker], case: str, inputs: str, *, rounds: int, seconds: float
-) -> dict[str, list[float]]:
-    """Median milliseconds of each round, workers taking turns."""
-    found: dict[str, list[float]] = {worker.name: [] for worker in workers}
-    for _ in range(rounds):
-        for worker in workers:
-            reply = worker.ask(case=case, inputs=inputs, seconds=seconds, least=3)
-            found[worker.name].append(statistics.median(reply["times"]))
-    return found
 
 
 def run_backend(backend: str, options: argparse.Namespace, folder: Path, joint_names: Sequence[str]) -> dict:
@@ -120,7 +78,8 @@ def run_backend(backend: str, options: argparse.Namespace, folder: Path, joint_n
         )
     for case, batch in CASES:
         workers = [ours, peer] + ([package] if package and case == "forward" else [])
-        times = measure(workers, case, files[batch], rounds=options.rounds, seconds=options.seconds)
+        turns = [(worker.name, worker, {"case": case, "inputs": files[batch]}) for worker in workers]
+        times = medians_of_rounds(turns, rounds=options.rounds, seconds=options.seconds)
         row = {
             "case": case,
             "batch": batch,
@@ -168,27 +127,39 @@ def table(results: dict) -> str:
     return "\n".join(lines)
 
 
-def insert(path: Path, text: str) -> None:
-    """Replace what stands between the marks."""
-    if not path.exists() or MARKS[0] not in path.read_text(encoding="utf-8"):
+def insert(path: Path, name: str, text: str) -> None:
+    """Replace what stands between the marks of a benchmark."""
+    begin, end = f"<!-- {name}:begin -->", f"<!-- {name}:end -->"
+    if not path.exists() or begin not in path.read_text(encoding="utf-8"):
         return
     old = path.read_text(encoding="utf-8")
-    pattern = re.compile(re.escape(MARKS[0]) + ".*?" + re.escape(MARKS[1]), re.DOTALL)
-    path.write_text(pattern.sub(lambda _: f"{MARKS[0]}\n{text}\n{MARKS[1]}", old), encoding="utf-8")
+    pattern = re.compile(re.escape(begin) + ".*?" + re.escape(end), re.DOTALL)
+    path.write_text(pattern.sub(lambda _: f"{begin}\n{text}\n{end}", old), encoding="utf-8")
 
 
-def machine(options: argparse.Namespace, backends: dict) -> dict:
-    names = [
-        line.split(":")[1].strip()
-        for line in Path("/proc/cpuinfo").read_text().splitlines()
-        if "model name" in line
-    ]
-    commit = subprocess.run(["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True, cwd=ROOT)
-    versions = next(iter(backends.values()))["versions"]
-    cpu = names[0] if names else platform.processor()
-    return {"cpu": cpu, "rounds": options.rounds, "seed": options.seed,
+def store(name: str, mark: str, results: dict, text: str) -> None:
+    """Write the results and put their table into the texts that have a place for it."""
+    path = HERE / "results" / f"{name}.json"
+    path.parent.mkdir(exist_ok=True)
+    path.write_text(json.dumps(results, indent=1) + "\n", encoding="utf-8")
+    for file in (HERE / "README.md", ROOT / "README.md"):
+        insert(file, mark, text)
+    sys.stdout.write(text + "\n")
+
+
+def machine(options: argparse.Namespace, versions: dict) -> dict:
+    return {"cpu": cpu_name(), "rounds": options.rounds, "seed": options.seed,
             "torch": versions["ours"]["torch"], "peer": versions["peer"]["py-soma-x"],
-            "commit": commit.stdout.strip()}  # fmt: skip
+            "commit": short_commit()}  # fmt: skip
+
+
+def run_forward(options: argparse.Namespace, folder: Path) -> None:
+    from soma_core.rig import load_canonical
+
+    names = load_canonical("mid")[1].user_joint_names
+    backends = {backend: run_backend(backend, options, folder, names) for backend in options.backends}
+    results = {"machine": machine(options, backends[options.backends[0]]["versions"]), "backends": backends}
+    store("forward_cpu", "benchmarks", results, table(results))
 
 
 def main() -> None:
@@ -196,26 +167,23 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--peer-python", required=True, help="interpreter with py-soma-x installed")
-    parser.add_argument("--backends", nargs="+", default=["soma", "anny"])
+    parser.add_argument("--only", choices=["forward", "inversion"], help="one of the two benchmarks")
+    parser.add_argument("--backends", nargs="+", default=["soma", "anny"], help="of the forward path")
     parser.add_argument("--rounds", type=int, default=5)
     parser.add_argument("--seconds", type=float, default=1.0, help="of each implementation in each round")
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--frames", type=int, default=100, help="of each sequence that is inverted")
     options = parser.parse_args()
     options.peer_python = str(Path(options.peer_python).absolute())
-    from soma_core.rig import load_canonical
-
-    names = load_canonical("mid")[1].user_joint_names
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         subprocess.run([sys.executable, "peers.py", "build", str(folder / "assets")], check=True, cwd=HERE)
-        backends = {backend: run_backend(backend, options, folder, names) for backend in options.backends}
-    results = {"machine": machine(options, backends), "backends": backends}
-    path = HERE / "results" / "forward_cpu.json"
-    path.parent.mkdir(exist_ok=True)
-    path.write_text(json.dumps(results, indent=1) + "\n", encoding="utf-8")
-    for file in (HERE / "README.md", ROOT / "README.md"):
-        insert(file, table(results))
-    sys.stdout.write(table(results) + "\n")
+        if options.only != "inversion":
+            run_forward(options, folder)
+        if options.only != "forward":
+            versions, rows = run_inversion(options, folder)
+            results = {"machine": machine(options, versions), "rows": rows}
+            store("inversion_cpu", "inversion", results, inversion_table(results))
 
 
 if __name__ == "__main__":

@@ -11,13 +11,22 @@ import resource
 import sys
 import time
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-__all__ = ["serve"]
+__all__ = ["Call", "Work", "serve"]
 
 Call = Callable[[], Any]
+
+
+@dataclass(frozen=True)
+class Work:
+    """A call to time, and how to make an array of what it returns, which is not timed."""
+
+    call: Call
+    array: Callable[[Any], np.ndarray] = np.asarray
 
 
 def _times(call: Call, seconds: float, least: int) -> list[float]:
@@ -29,16 +38,20 @@ def _times(call: Call, seconds: float, least: int) -> list[float]:
     return found
 
 
-def serve(prepare: Callable[[str, dict[str, np.ndarray]], Call], versions: dict[str, str]) -> None:
+def serve(prepare: Callable[[str, dict[str, np.ndarray]], Call | Work], versions: dict[str, str]) -> None:
     """Answer requests on stdin until it closes.
 
+    A request names a case and a file of inputs; with ``output`` the result is stored there, else calls are
+    timed. ``warm`` calls come first; cases of the same inputs stay ready.
+
     Args:
-        prepare: (case, inputs) -> a call that does the work once and returns vertices (batch, v, 3).
+        prepare: (case, inputs) -> work that does the case once.
         versions: what runs here.
     """
     answer = sys.stdout
     sys.stdout = sys.stderr  # whatever a library prints must not reach the protocol
-    ready: dict[str, Call] = {}
+    ready: dict[str, Work] = {}
+    inputs = None
 
     def reply(**values: Any) -> None:
         answer.write(json.dumps(values) + "\n")
@@ -47,16 +60,19 @@ def serve(prepare: Callable[[str, dict[str, np.ndarray]], Call], versions: dict[
     reply(versions=versions)
     for line in sys.stdin:
         request = json.loads(line)
-        key = f"{request['case']}-{request['inputs']}"
-        if key not in ready:
+        case = request["case"]
+        if inputs != request["inputs"]:
             ready.clear()
-            with np.load(request["inputs"], allow_pickle=False) as file:
-                ready[key] = prepare(request["case"], {name: file[name] for name in file.files})
-            for _ in range(3):
-                ready[key]()
+            inputs = request["inputs"]
+        if case not in ready:
+            with np.load(inputs, allow_pickle=False) as file:
+                work = prepare(case, {name: file[name] for name in file.files})
+            ready[case] = work if isinstance(work, Work) else Work(work)
+            for _ in range(request.get("warm", 3)):
+                ready[case].call()
         if request.get("output"):
-            np.save(request["output"], np.asarray(ready[key]()))
+            np.save(request["output"], ready[case].array(ready[case].call()))
             reply(saved=request["output"])
         else:
-            found = _times(ready[key], request["seconds"], request["least"])
+            found = _times(ready[case].call, request["seconds"], request["least"])
             reply(times=found, peak_mb=resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024)

@@ -1,0 +1,114 @@
+"""Pose inversion against the peer: errors on the same meshes first, then alternating rounds.
+
+Cases: ``own`` is a motion on meshes that each implementation posed itself, so that an exact answer exists;
+``woman`` and ``child`` are meshes that the anny package posed with its own rig of 104 bones, brought to the
+canonical mesh once and given to both. Errors are those of the mid mesh under each implementation's own
+forward model, whatever the level of detail of the fit; ``own`` at low is measured on what was posed.
+"""
+
+from __future__ import annotations
+
+import argparse
+import statistics
+import sys
+from pathlib import Path
+
+import numpy as np
+from inputs import own_motion, own_rig_meshes
+from processes import Worker, medians_of_rounds
+
+__all__ = ["inversion_table", "run_inversion"]
+
+LODS = ("low", "mid")
+OURS, REFERENCE = "gauss_newton", "analytical"
+PEER_METHODS = ("skeleton_transfer", REFERENCE, "autograd", "analytical_autograd")
+SLOW = ("autograd", "analytical_autograd")
+"""A hundred steps of Adam: timed once a sequence."""
+BARS = {"low": 3, "mid": 8}
+"""How many times faster than the peer's analytical solver we mean to be."""
+WORST_MM = {"own": 20.0, "woman": 30.0, "child": 30.0}
+"""Mean error beyond which a result is wrong, whoever made it, and nothing is timed."""
+
+
+def run_inversion(options: argparse.Namespace, folder: Path) -> tuple[dict, list[dict]]:
+    """Versions of both, and a row for each case, level of detail and method."""
+    files = {"own": folder / "own.npz"}
+    np.savez(files["own"], **own_motion(options.frames, options.seed))
+    for name, arrays in own_rig_meshes(options.frames, options.seed).items():
+        files[name] = folder / f"{name}.npz"
+        np.savez(files[name], **arrays)
+    ours = Worker("ours", [sys.executable, "ours.py", "inversion"])
+    assets = str(folder / "assets")
+    peer = Worker("peer", [options.peer_python, "peers.py", "py-soma-x-inversion", assets])
+    rows = []
+    for case, file in files.items():
+        for lod in LODS:
+            rows += _compare(case, lod, str(file), (ours, peer), options, folder)
+    versions = {worker.name: worker.versions for worker in (ours, peer)}
+    for worker in (ours, peer):
+        rows.append({"implementation": worker.name, "peak_mb": worker.peak_mb})
+        worker.close()
+    return versions, rows
+
+
+def _compare(
+    case: str, lod: str, file: str, workers: tuple[Worker, Worker], options: argparse.Namespace, folder: Path
+) -> list[dict]:
+    """Errors of every method, then times."""
+    ours, peer = workers
+    methods = [(ours, OURS), *((peer, method) for method in PEER_METHODS)]
+    rows = []
+    for worker, method in methods:
+        request = {"case": f"{lod}/{method}", "inputs": file, "warm": 0 if method in SLOW else 1}
+        path = folder / "result.npy"
+        worker.ask(**request, output=str(path))
+        found, target = np.load(path)
+        rows.append({"case": case, "lod": lod, "implementation": worker.name, "method": method,
+                     **_errors(found, target)})  # fmt: skip
+        if not rows[-1]["mean_mm"] < WORST_MM[case]:
+            raise SystemExit(f"{worker.name}, {method}: {rows[-1]['mean_mm']:.1f} mm on {case}; not timed")
+    quick = [(f"{worker.name} {method}", worker, {"case": f"{lod}/{method}", "inputs": file})
+             for worker, method in methods if method not in SLOW]  # fmt: skip
+    times = medians_of_rounds(quick, rounds=options.rounds, seconds=options.seconds, least=2)
+    slow = [(f"peer {method}", peer, {"case": f"{lod}/{method}", "inputs": file}) for method in SLOW]
+    times |= medians_of_rounds(slow, rounds=1, seconds=0.0, least=1)
+    mine = times[f"ours {OURS}"]
+    for row in rows:
+        spent = times[f"{row['implementation']} {row['method']}"]
+        row["frames_per_second"] = 1e3 * options.frames / statistics.median(spent)
+        if row["implementation"] == "peer":
+            pairs = zip(spent, mine * len(spent), strict=False)
+            row["ratio"] = statistics.median(theirs / ms for theirs, ms in pairs)
+        sys.stderr.write(f"{row}\n")
+    return rows
+
+
+def _errors(found: np.ndarray, target: np.ndarray) -> dict[str, float]:
+    error = 1e3 * np.linalg.norm(found.astype(np.float64) - target, axis=-1)
+    return {"mean_mm": float(error.mean()), "median_mm": float(np.median(error)),
+            "p95_mm": float(np.percentile(error, 95)), "max_mm": float(error.max())}  # fmt: skip
+
+
+def inversion_table(results: dict) -> str:
+    """The figures as markdown."""
+    lines = ["| case | LOD | method | mean, mm | median | P95 | max | frames/s | ours is faster by | bar |",
+             "|---|---|---|---|---|---|---|---|---|---|"]  # fmt: skip
+    for row in results["rows"]:
+        if "case" not in row:
+            continue
+        name = row["method"].replace("_", " ")
+        name = f"**ours: {name}**" if row["implementation"] == "ours" else f"py-soma-x: {name}"
+        ratio = f"{row['ratio']:.1f}x" if "ratio" in row else ""
+        bar = f"{BARS[row['lod']]}x" if row["method"] == REFERENCE else ""
+        cells = [f"{row[key]:.4g}" for key in ("mean_mm", "median_mm", "p95_mm", "max_mm")]
+        lines.append(
+            f"| {row['case']} | {row['lod']} | {name} | {' | '.join(cells)} | "
+            f"{row['frames_per_second']:,.0f} | {ratio} | {bar} |"
+        )
+    peaks = {row["implementation"]: row["peak_mb"] for row in results["rows"] if "peak_mb" in row}
+    machine = results["machine"]
+    lines += ["", f"Peak memory {peaks['ours']:.0f} MB against {peaks['peer']:.0f} MB.", "",
+              f"{machine['cpu']}, 2 threads, float32, medians of {machine['rounds']} alternating rounds; "
+              f"torch {machine['torch']}, py-soma-x {machine['peer']}, commit {machine['commit']}. "
+              "Written by `python benchmarks/run.py --only inversion`."]  # fmt: skip
+    return "\n".join(lines)
