@@ -302,11 +302,11 @@ def two_threads():
 @pytest.mark.parametrize(("dtype", "warp"), KINDS)
 def test_two_threads_find_what_one_finds(dtype, warp, two_threads):
     """Other batched factorisations of this size have gone wrong with several threads."""
-    given = case(33 if warp else FRAMES, dtype=dtype, weighted=0)
+    given = case(33, dtype=dtype)
     found = []
     for count in (1, 2):
         two_threads(count)
-        found.append(given.reached(given.solve(given.bind, warp=warp, iterations=30)))
-    torch.testing.assert_close(found[1], found[0], atol=0.0 if warp else REACHED_M[dtype], rtol=0)
-    off = (found[1] - given.vertices)[:, given.body.structure.fitted]
-    assert off.abs().max() < REACHED_M[dtype]
+        found.append(given.reached(given.solve(given.bind, warp=warp, iterations=2)))
+    # Far from the minimum a step carries rounding on; a wrong factor would be off by decimetres.
+    bound = 0.0 if warp else {torch.float64: 1e-8, torch.float32: 3e-3}[dtype]
+    torch.testing.assert_close(found[1], found[0], atol=bound, rtol=0)
