@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -40,8 +41,10 @@ _CHUNK = 32
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class WrapMeshes:
-    """The two files of the wrap pair as they are: vertices (n, 3) and triangles (t, 3) each."""
+    """The two files of the wrap pair as they are: where, vertices (n, 3) and triangles (t, 3) of each."""
 
+    native_path: Path
+    path: Path
     native: np.ndarray
     native_triangles: np.ndarray
     vertices: np.ndarray
@@ -143,8 +146,9 @@ class Context:
         native, native_triangles = read_obj(pair.native)
         vertices, triangles = read_obj(pair.wrap)
         return WrapMeshes(
-            native=native, native_triangles=native_triangles, vertices=vertices, triangles=triangles
-        )
+            native_path=pair.native, path=pair.wrap, native=native, native_triangles=native_triangles,
+            vertices=vertices, triangles=triangles,
+        )  # fmt: skip
 
     @functools.cached_property
     def covered(self) -> np.ndarray:

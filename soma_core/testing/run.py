@@ -22,7 +22,7 @@ from soma_core.testing.checks import CORE_CHECKS
 from soma_core.testing.conformance import Check, CheckFailedError, Level
 from soma_core.testing.context import Context
 from soma_core.testing.global_state import kept
-from soma_core.testing.report import Outcome, Report
+from soma_core.testing.report import Outcome, Report, State
 
 __all__ = ["ConformanceRun", "check_backend", "plugin_checks"]
 
@@ -172,7 +172,7 @@ def _told(error: BaseException, check: Check, package: str) -> tuple[str, str, s
 
 def _as_expected(outcome: Outcome, reason: str) -> Outcome:
     """Turn a failure that has a reason into an expected one, and a pass into a failure."""
-    changed = {"failed": "expected", "passed": "fixed"}
+    changed: dict[str, State] = {"failed": "expected", "passed": "fixed"}
     if not reason or outcome.state not in changed:
         return outcome
     return replace(outcome, state=changed[outcome.state], reason=reason)
@@ -233,8 +233,8 @@ def _unknown(argument: str, check_id: str, known: Iterable[str]) -> InputError:
     return InputError(
         argument,
         got=repr(check_id),
-        expected=f"ids of checks: {', '.join(known)}",
-        fix=did_you_mean(check_id, known) or "Take it out.",
+        expected="the id of a check, such as wrap-order",
+        fix=did_you_mean(check_id, known) or f"The ids are {', '.join(known)}.",
     )
 
 

@@ -367,6 +367,18 @@ MUTANTS = (
         lambda made: made.remesh("native.obj", _brim),
     ),
     Mutant(
+        "transfer-neutral",
+        r"canonical vertex \d+ of the transferred default body: got \d\.\d\d mm from the wrap",
+        _all(
+            _ride_on_sliver,
+            _in(
+                _GENERATOR,
+                "        x, y, z =",
+                "        template = template.round(decimals=2)\n        x, y, z =",
+            ),
+        ),
+    ),
+    Mutant(
         "transfer-random",
         r"random body \d, canonical vertex .*: got 2% of the edges over",
         _all(_rest("torch.where(params['shape'][:, :1, None] > 0.5, v.flip(1), v)"), _not_linear),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 
 import pytest
 
@@ -67,7 +68,7 @@ def test_what_a_check_needs_comes_before_it_and_is_no_slower():
     for place, item in enumerate(CORE_CHECKS):
         for need in item.needs:
             assert IDS.index(need) < place, f"{item.id} needs {need}"
-            assert level[need] == "core", f"{item.id} needs {need}"
+            assert level[need] == "core" or item.level == "full", f"{item.id} needs {need}"
 
 
 @pytest.mark.parametrize("bad", ["Licence", "a b", "a_b", "", "-a"])
@@ -109,11 +110,9 @@ def test_only_takes_checks_of_any_level(tmp_path):
     assert "gradient" in states(check_package(tmp_path, only=["gradient"], level="core"))
 
 
-@pytest.mark.parametrize("pattern", ["licens", "wrapp-*"])
+@pytest.mark.parametrize("pattern", ["licens", "wrapp-*", "x"])
 def test_an_unknown_id_is_refused(tmp_path, pattern):
-    with pytest.raises(
-        InputError, match=rf"only: got {pattern!r}, expected ids of checks: declares".replace("*", r"\*")
-    ):
+    with pytest.raises(InputError, match=re.escape(f"only: got {pattern!r}, expected the id of a check")):
         check_package(tmp_path, only=[pattern])
 
 

@@ -35,7 +35,7 @@ def neutral_equals_obj(context: Context) -> None:
         sizes = " by ".join(f"{np.ptp(mesh, axis=0).max():.4g}" for mesh in (body, file))
         raise CheckFailedError(
             f"native vertex {worst} of the default body",
-            got=f"{1000 * distance[worst]:.2f} mm from {context.spec.wrap.native} (extents {sizes} m)",
+            got=f"{1000 * distance[worst]:.2f} mm from {context.wrap.native_path} (extents {sizes} m)",
             expected=f"at most {1000 * _OBJ_M:.1f} mm",
             fix="Write the OBJ from the generator's default body, in its unit, axes and vertex order; "
             "declare wrap_up and wrap_forward where the file has other axes.",

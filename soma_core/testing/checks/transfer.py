@@ -97,7 +97,7 @@ def transfer_random(context: Context) -> None:
             )
 
 
-@check("similarity-equivariant", needs=("stature",))
+@check("similarity-equivariant", needs=("transfer-neutral", "transfer-random"))
 def similarity_equivariant(context: Context) -> None:
     """Turning, scaling and moving the native body does the same to the canonical one."""
     transfer = copy.deepcopy(context.layer.rest_shape.transfer).float()

@@ -35,20 +35,20 @@ def wrap_reads(context: Context) -> None:
 @check("wrap-count", level="core", needs=("wrap-reads",), unless=_no_wrap)
 def wrap_count(context: Context) -> None:
     """The wrap has one vertex for each canonical vertex."""
-    check_count(context.wrap.vertices, context.mesh, path=context.spec.wrap.wrap)
+    check_count(context.wrap.vertices, context.mesh, path=context.wrap.path)
 
 
 @check("wrap-order", level="core", needs=("wrap-count",), unless=_no_wrap)
 def wrap_order(context: Context) -> None:
     """The wrap's vertices are in canonical order."""
-    check_order(context.wrap.vertices, context.mesh, path=context.spec.wrap.wrap)
+    check_order(context.wrap.vertices, context.mesh, path=context.wrap.path)
     edges = canonical_edges(context.mesh)
     limit = _STRAY_RATIO * _relative_reach(context.mesh.vertices, edges).max()
     reach = _relative_reach(context.wrap.vertices, edges)
     worst = int(reach.argmax())
     if reach[worst] > limit:
         raise CheckFailedError(
-            f"wrap {context.spec.wrap.wrap}, {context.vertex(worst)}",
+            f"wrap {context.wrap.path}, {context.vertex(worst)}",
             got=f"neighbours {reach[worst]:.1%} of the body's diagonal away",
             expected=f"at most {limit:.1%}",
             fix="The vertex took the place of another; export again with the vertex order kept.",
@@ -66,7 +66,7 @@ def _relative_reach(points: np.ndarray, edges: tuple[np.ndarray, np.ndarray]) ->
 @check("wrap-faces", level="core", needs=("wrap-order",), unless=_no_wrap)
 def wrap_faces(context: Context) -> None:
     """The wrap's faces are those of the canonical mesh."""
-    check_faces(context.wrap.triangles, context.mesh, path=context.spec.wrap.wrap)
+    check_faces(context.wrap.triangles, context.mesh, path=context.wrap.path)
 
 
 @check("wrap-distance", level="core", needs=("wrap-faces", "fill-segments"), unless=_no_wrap)
@@ -78,7 +78,7 @@ def wrap_distance(context: Context) -> None:
     astray = float((distance > _CLOSE * diagonal).sum() / context.covered.sum())
     if astray > _ASTRAY or distance[worst] > _LOOSE * diagonal:
         raise CheckFailedError(
-            f"wrap {context.spec.wrap.wrap}, {context.vertex(worst)}",
+            f"wrap {context.wrap.path}, {context.vertex(worst)}",
             got=f"{millimetres * distance[worst]:.0f} mm to the native surface, and {astray:.1%} of the "
             f"vertices further than {millimetres * _CLOSE * diagonal:.0f} mm",
             expected=f"at most {millimetres * _LOOSE * diagonal:.0f} mm, and {_ASTRAY:.0%}",
