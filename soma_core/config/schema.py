@@ -179,7 +179,7 @@ class InversionChoice:
     """How poses are found: the stages in their order, and what each of them takes."""
 
     stages: list[str] = field(default_factory=lambda: ["procrustes", "gauss_newton"])
-    iterations: int = 20
+    iterations: int = 40
     tolerance: float = 2e-5
     robust: float | None = None
     robust_rounds: int = 10
