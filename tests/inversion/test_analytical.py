@@ -143,6 +143,22 @@ def test_no_sweep_raises_the_energy(make, spread):
         energy = now
 
 
+def test_a_level_that_would_overshoot_is_left_as_it_was():
+    """Three fingers or more move each of these vertices; each would make up for all of the displacement."""
+    body = synthetic()
+    fingers = [joint(body, f"LeftHand{finger}2") for finger in ("Thumb", "Index", "Middle", "Ring", "Pinky")]
+    shared = (body.skin_weights[:, fingers] > 0.02).sum(1) >= 3
+    case = Case(body, weights=body.plain_weights() * torch.tensor(shared), off=0)
+    vertices = case.vertices + 1e-3 * randn(FRAMES, 1, 3, seed=3)
+    target, origin = body.moments().target(vertices, case.rest)
+    start = pose_about(*body.poses(FRAMES), origin)
+    stage = analytical(body)
+    level = Level(body.structure, np.array(fingers), device=CPU)
+    found = stage.sweep(start, [level], target, case.rest, stage.solver.dense(case.rest.second))
+    assert torch.equal(found.relative, start.relative)
+    assert torch.equal(found.accepted, start.accepted)
+
+
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
 def test_a_solution_is_a_fixed_point(dtype):
     case = Case(real(), dtype=dtype)
