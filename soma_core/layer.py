@@ -168,15 +168,19 @@ class SomaLayer(torch.nn.Module):
         relative = check_rotations(
             rotations, len(self.joint_names), self.dtype, self.device, validate=self.validate
         )
-        self._check_identity(identity)
+        self.check_identity(identity)
         batch = _common_batch(identity.batch_size, len(relative))
         shift = check_translation(translation, batch, self.dtype, self.device)
         bone_scale = check_bone_scale(bone_scale, batch, len(self.joint_names), self.dtype, self.device)
         relative = relative.expand(batch, *relative.shape[1:])
         return self.animation.pose(identity, relative, shift, absolute=absolute, bone_scale=bone_scale)
 
-    def _check_identity(self, identity: Identity) -> None:
-        """Refuse an identity that another kind of layer made: other rig, LOD, dtype or device."""
+    def check_identity(self, identity: Identity) -> None:
+        """Refuse an identity that another kind of layer made: other rig, LOD, dtype or device.
+
+        Raises:
+            InputError: what differs.
+        """
         same_rig = not identity.rig_revision or identity.rig_revision == self.rig.revision
         if not same_rig or identity.rest.shape[1] != self.mesh.vertex_count:
             raise InputError(

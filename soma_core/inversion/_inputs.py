@@ -17,7 +17,7 @@ def check_vertices(vertices: object, count: int, *, fix: str) -> Tensor:
     if not isinstance(vertices, Tensor) or not vertices.is_floating_point():
         raise InputError(
             "vertices",
-            got=getattr(vertices, "dtype", type(vertices).__name__),
+            got=vertices.dtype if isinstance(vertices, Tensor) else type(vertices).__name__,
             expected="a floating torch.Tensor",
             fix="Wrap it: torch.as_tensor(vertices).",
         )
@@ -28,7 +28,7 @@ def check_vertices(vertices: object, count: int, *, fix: str) -> Tensor:
 
 
 def check_weights(weights: Tensor | None, default: Tensor, frames: int) -> Tensor:
-    """Vertex weights (1 or frames, v), not negative; `default` (v,) where none are given."""
+    """Vertex weights (1 or frames, v), finite, not negative; `default` (v,) where none are given."""
     if weights is None:
         return default[None]
     count = len(default)
@@ -40,12 +40,12 @@ def check_weights(weights: Tensor | None, default: Tensor, frames: int) -> Tenso
             expected=f"({count},) or ({frames}, {count})",
             fix="Give one weight a canonical vertex, for all frames or for each.",
         )
-    if not bool((weights >= 0).all()):
-        worst = float(weights[~(weights >= 0)][0])
+    usable = (weights >= 0) & (weights < torch.inf)
+    if not bool(usable.all()):
         raise InputError(
             "weights",
-            got=worst,
-            expected="numbers of at least zero",
+            got=float(weights[~usable][0]),
+            expected="finite numbers of at least zero",
             fix="Use 0 for vertices to leave out.",
         )
     return weights if weights.ndim == 2 else weights[None]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Literal, get_args
 
 import torch
 from torch import Tensor
@@ -24,7 +24,7 @@ from soma_core.inversion.problem import Pose, Problem
 from soma_core.inversion.result import InversionResult, joined
 from soma_core.inversion.start import cloud_extent
 from soma_core.inversion.structure import moment_structure
-from soma_core.layer import SomaLayer
+from soma_core.layer import Kernels, SomaLayer
 from soma_core.rig import load_canonical
 from soma_core.skeleton.identity import Identity
 from soma_core.topology.correspondence import load_correspondence
@@ -99,7 +99,7 @@ class PoseInversion(torch.nn.Module):
         robust: float | None = None,
         robust_rounds: int = 10,
         priors: PosePriors | None = None,
-        kernels: Literal["auto", "torch", "warp"] = "auto",
+        kernels: Kernels = "auto",
     ) -> None:
         super().__init__()
         options = LadderOptions(
@@ -107,6 +107,10 @@ class PoseInversion(torch.nn.Module):
             robust_rounds=robust_rounds, analytical=analytical or AnalyticalOptions(),
             autograd=autograd or AutogradOptions(),
         )  # fmt: skip
+        if kernels not in get_args(Kernels):
+            raise InputError(
+                "kernels", got=repr(kernels), expected="'auto', 'torch' or 'warp'", fix="Pass kernels='auto'."
+            )
         self.layer, self.priors = layer, priors or PosePriors()
         # Not measured on CUDA, where one thread would hold a whole frame: the dense reference runs there.
         self.warp = warp = kernels == "warp" or (kernels == "auto" and layer.device.type == "cpu")
@@ -192,6 +196,7 @@ class PoseInversion(torch.nn.Module):
     ) -> _Frames:
         """Check what belongs to the frames, and bring it together."""
         count = len(vertices)
+        self.layer.check_identity(identity)
         if identity.batch_size not in (1, count):
             raise InputError(
                 "identity",
@@ -203,6 +208,11 @@ class PoseInversion(torch.nn.Module):
         user_joints = self.layer.rig.joint_count - 1
         bone_scale = check_bone_scale(bone_scale, count, user_joints, self.layer.dtype, self.layer.device)
         shared = identity.batch_size == 1 and len(weights) == 1
+        if initial is not None and len(initial.rotations) != count:
+            raise InputError(
+                "initial", got=f"{len(initial.rotations)} frames", expected=f"{count} frames",
+                fix="Give the earlier result of the same frames.",
+            )  # fmt: skip
         return _Frames(
             vertices=vertices, identity=identity, weights=weights, bone_scale=bone_scale, initial=initial,
             rest=self.prepare(identity, weights) if shared else None,
@@ -257,7 +267,8 @@ class PoseInversion(torch.nn.Module):
             bone_scale=frames.bone_scale, terms=terms,
         )  # fmt: skip
         extent, side = cloud_extent(target, rest)
-        scale = extent.median(1).values
+        known = torch.where(rest.own[..., 3, 3] > 0, extent, torch.nan)
+        scale = known.nanmedian(1).values
         upright = (side * rest.own[..., 3, 3]).sum(1) > 0
         usable = finite & upright & (scale > _SCALES[0]) & (scale < _SCALES[1])
         eye = torch.eye(3, dtype=vertices.dtype, device=vertices.device)
@@ -270,6 +281,8 @@ class PoseInversion(torch.nn.Module):
         translation = torch.where(usable[:, None], pose.translation + origin, torch.zeros_like(origin))
         error, residual = compare(self.layer.animation, problem, relative, translation, warp=self.warp)
         error.masked_fill_(~usable[:, None], torch.nan)
+        if vertices is not frames.vertices:
+            error.masked_fill_(~torch.isfinite(frames.vertices).all(-1), torch.nan)
         return InversionResult(
             rotations=relative,
             translation=translation,
@@ -278,7 +291,7 @@ class PoseInversion(torch.nn.Module):
             determined=self._determined(extent > _COLLAPSED) & usable[:, None],
             converged=(pose.last_change < self.ladder.options.tolerance) & usable,
             iterations=pose.accepted,
-            residual=residual,
+            residual=residual.masked_fill(~usable, torch.nan),
         ), scale
 
     def _determined(self, kept: Tensor) -> Tensor:

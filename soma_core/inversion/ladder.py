@@ -46,7 +46,8 @@ class LadderOptions:
         robust_rounds: how often the residuals are looked at again.
 
     Raises:
-        InputError: an unknown stage, a negative number of iterations, a robust scale of zero or less.
+        InputError: an unknown stage, a negative number of iterations or tolerance, a robust scale of zero
+            or less.
     """
 
     stages: Sequence[Stage] = ("procrustes", "gauss_newton")
@@ -68,6 +69,10 @@ class LadderOptions:
         if self.iterations < 0:
             raise InputError(
                 "iterations", got=self.iterations, expected="at least 0", fix="Pass iterations=12."
+            )
+        if not self.tolerance >= 0:
+            raise InputError(
+                "tolerance", got=self.tolerance, expected="a length [m]", fix="Pass tolerance=5e-5."
             )
         if self.robust is not None and not self.robust > 0:
             raise InputError("robust", got=self.robust, expected="a length [m]", fix="Pass 0.01, or None.")

@@ -21,14 +21,14 @@ class InversionResult:
         rotations: T-pose-relative rotations, (frames, J - 1, 3, 3).
         translation: world position of the Hips [m], (frames, 3).
         vertex_error: distance of each canonical vertex of the reconstruction to its target [m], (frames, v);
-            NaN where the frame is not valid, meaningless where the vertex has no weight and no value.
+            NaN where the frame is not valid or the target has no value.
         valid: (frames,) bool; False where a frame could not be used (NaN, collapsed, mirrored, out of scale).
             Its rotations are identity, and no other frame is affected.
         determined: (frames, J - 1) bool; whether the target determines the joint's rotation. False for joints
             without skin weight, without weighted vertices, or whose vertices have collapsed to a point.
         converged: (frames,) bool; the last accepted step no longer lowered the energy noticeably.
         iterations: (frames,) int, accepted steps.
-        residual: root mean square of the weighted vertex error [m], (frames,).
+        residual: root mean square of the weighted vertex error [m], (frames,); NaN where not valid.
     """
 
     rotations: Tensor
