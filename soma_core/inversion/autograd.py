@@ -220,7 +220,7 @@ class Autograd(torch.nn.Module):
         taken = torch.zeros_like(start.accepted)
         for step in range(options.iterations + 1):
             last, value = value.detach(), loss(turns.index_copy(1, n, from_six(six)), shift)
-            better = value.detach() < lowest
+            better = (value.detach() < lowest) & (step > 0)
             taken = taken + better
             lowest = torch.where(better, value.detach(), lowest)
             best_six = torch.where(better[:, None, None, None], six.detach(), best_six)
