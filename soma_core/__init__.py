@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from soma_core.animation.posed import Posed
     from soma_core.errors import AssetError, InputError, SomaError
+    from soma_core.inversion import InversionResult, PoseInversion
     from soma_core.io import read_motion, write_motion
     from soma_core.io.motion import Motion
     from soma_core.layer import SomaLayer
@@ -30,9 +31,11 @@ __all__ = [
     "Generator",
     "Identity",
     "InputError",
+    "InversionResult",
     "LinearBasis",
     "Motion",
     "Parameter",
+    "PoseInversion",
     "Posed",
     "SomaError",
     "SomaLayer",
@@ -51,9 +54,11 @@ _HOME = {
     "Generator": "soma_core.plugin.spec",
     "Identity": "soma_core.skeleton.identity",
     "InputError": "soma_core.errors",
+    "InversionResult": "soma_core.inversion",
     "LinearBasis": "soma_core.plugin.spec",
     "Motion": "soma_core.io.motion",
     "Parameter": "soma_core.plugin.spec",
+    "PoseInversion": "soma_core.inversion",
     "Posed": "soma_core.animation.posed",
     "SomaError": "soma_core.errors",
     "SomaLayer": "soma_core.layer",

@@ -93,8 +93,7 @@ class GaussNewton(torch.nn.Module):
             rest: moments of one identity or of one a frame.
             start: poses to begin from.
             iterations: number of steps tried; a step that would raise the energy is undone and damped.
-            tolerance: a frame rests once a step changed its energy by less, as a root mean square [m],
-                whatever its neighbours do.
+            tolerance: a frame rests once a step changed its energy by less, as a root mean square [m].
             terms: soft terms on single joints, and hinges; `start` must keep the hinges.
         """
         if self.plan is not None and iterations:

@@ -123,7 +123,8 @@ def _pull_back(
 def _solve(matrix: Tensor, slope: Tensor) -> Tensor:
     dense = matrix.flatten(3, 4).flatten(1, 2)
     diagonal = dense.diagonal(dim1=-2, dim2=-1)
-    factor, _ = torch.linalg.cholesky_ex(dense + torch.diag_embed(_RIDGE[dense.dtype] * diagonal.clamp_min(1e-12)))
+    ridge = _RIDGE[dense.dtype] * diagonal.clamp_min(1e-12)
+    factor, _ = torch.linalg.cholesky_ex(dense + torch.diag_embed(ridge))
     return torch.cholesky_solve(slope.flatten(1)[..., None], factor).view_as(slope)
 
 

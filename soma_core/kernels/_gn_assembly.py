@@ -43,7 +43,7 @@ def assembly_functions(scalar: str, lanes: int, *, shared: bool) -> SimpleNamesp
     """Sums of moments and forces up the tree, kept to the blocks that are not zero."""
     types, tree = lane_types(scalar, lanes), tree_functions(scalar, lanes, shared=shared)
     pair_moment = _pair_moment(types, tree)
-    column_moments = _column_moments(types, tree, pair_moment)
+    column_moments = _column_moments(types, tree, pair_moment, _hand_up(tree))
     moments = _moments(types, tree, column_moments)
     return SimpleNamespace(moments=moments, forces=_forces(types, tree), finish=_finish(tree))
 
@@ -85,7 +85,36 @@ def _pair_moment(types, tree):
     return pair_moment
 
 
-def _column_moments(types, tree, pair_moment):
+def _hand_up(tree):
+    frames = tree.frames
+
+    @wp.func
+    def hand_up(
+        w: int, e: int, k: int, plan: Plan, places: frames, column: frames, blocks: frames, root: frames
+    ):
+        """Keep one row of a column, and add it to the row of the joint's parent, about the parent."""
+        i = 16 * plan.row_joint[e]
+        slot = plan.row_slot[e]
+        if slot >= 0:
+            for c in range(12):
+                blocks[w, 12 * slot + c] += column[w, i + c]
+        if i == 0:
+            for c in range(4):
+                root[w, 4 * k + c] += column[w, 12 + c]
+        else:
+            p = 16 * plan.row_parent[e]
+            for r in range(3):
+                shift = places[w, 3 * plan.row_joint[e] + r] - places[w, 3 * plan.row_parent[e] + r]
+                for c in range(4):
+                    moved = wp.cw_mul(shift, column[w, i + 12 + c])
+                    column[w, p + 4 * r + c] += column[w, i + 4 * r + c] + moved
+            for c in range(4):
+                column[w, p + 12 + c] += column[w, i + 12 + c]
+
+    return hand_up
+
+
+def _column_moments(types, tree, pair_moment, hand_up):
     real, vec, frames, constants = types.real, types.vec, tree.frames, tree.constants
 
     @wp.func
@@ -104,22 +133,7 @@ def _column_moments(types, tree, pair_moment):
                 turns, column,
             )  # fmt: skip
         for e in range(plan.row_start[k], plan.row_start[k + 1]):
-            i = plan.row_joint[e]
-            slot = plan.row_slot[e]
-            if i == 0:
-                for c in range(4):
-                    root[w, 4 * k + c] += column[w, 12 + c]
-            else:
-                p = plan.row_parent[e]
-                for c in range(4):
-                    last = column[w, 16 * i + 12 + c]
-                    for r in range(3):
-                        entry = column[w, 16 * i + 4 * r + c]
-                        shift = places[w, 3 * i + r] - places[w, 3 * p + r]
-                        column[w, 16 * p + 4 * r + c] += entry + wp.cw_mul(shift, last)
-                        if slot >= 0:
-                            blocks[w, 12 * slot + 4 * r + c] += entry
-                    column[w, 16 * p + 12 + c] += last
+            hand_up(w, e, k, plan, places, column, blocks, root)
 
     return column_moments
 

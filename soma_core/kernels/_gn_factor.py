@@ -23,7 +23,8 @@ def factor_functions(scalar: str, lanes: int) -> SimpleNamespace:
     triangle = _triangle(types, frames)
     eliminate = _eliminate(types, frames)
     return SimpleNamespace(
-        factorise=_factorise(types, frames, triangle, eliminate), solve=_solve(types, frames)
+        factorise=_factorise(types, frames, triangle, eliminate),
+        solve=_solve(frames, _forward(frames), _backward(frames)),
     )
 
 
@@ -118,10 +119,10 @@ def _factorise(types, frames, triangle, eliminate):
     return factorise
 
 
-def _solve(types, frames):
+def _forward(frames):
     @wp.func
-    def solve(w: int, plan: Plan, blocks: frames, carry: frames, last: frames, inverse: frames, x: frames):
-        """Replace the right-hand side `x` (n + 1, 3) by the solution."""
+    def forward(w: int, plan: Plan, blocks: frames, carry: frames, last: frames, inverse: frames, x: frames):
+        """Solve with the factor; the translation all the way."""
         count = plan.joint.shape[0]
         for k in range(count):
             d = 12 * plan.block_start[k]
@@ -156,6 +157,16 @@ def _solve(types, frames):
         x[w, t] = t0
         x[w, t + 1] = t1
         x[w, t + 2] = t2
+
+    return forward
+
+
+def _backward(frames):
+    @wp.func
+    def backward(w: int, plan: Plan, blocks: frames, carry: frames, inverse: frames, x: frames):
+        """Solve with the transposed factor, the translation being known."""
+        count = plan.joint.shape[0]
+        t = 3 * count
         for n in range(count):
             k = count - 1 - n
             d = 12 * plan.block_start[k]
@@ -184,5 +195,15 @@ def _solve(types, frames):
             x[w, 3 * k] = z0
             x[w, 3 * k + 1] = z1
             x[w, 3 * k + 2] = z2
+
+    return backward
+
+
+def _solve(frames, forward, backward):
+    @wp.func
+    def solve(w: int, plan: Plan, blocks: frames, carry: frames, last: frames, inverse: frames, x: frames):
+        """Replace the right-hand side `x` (n + 1, 3) by the solution."""
+        forward(w, plan, blocks, carry, last, inverse, x)
+        backward(w, plan, blocks, carry, inverse, x)
 
     return solve

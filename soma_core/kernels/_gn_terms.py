@@ -13,7 +13,11 @@ __all__ = ["term_functions", "terms_struct"]
 
 @functools.cache
 def terms_struct(scalar: str, lanes: int):
-    """``inversion.priors.JointTerms`` as device arrays; `mass` is the sum of vertex weights of each frame."""
+    """``inversion.priors.JointTerms`` as device arrays.
+
+    `mass` is the sum of the vertex weights of each frame, `hinges` the number of columns, or zero where no
+    joint is a hinge.
+    """
     types = lane_types(scalar, lanes)
     numbers = wp.array(dtype=types.real)
 
@@ -36,12 +40,12 @@ def term_functions(scalar: str, lanes: int) -> SimpleNamespace:
     """Energy, gradient and matrix of the terms; stiffening and projection of hinges."""
     types, terms = lane_types(scalar, lanes), terms_struct(scalar, lanes)
     frames = wp.array2d(dtype=types.vec)
-    deviation = _deviation(types, frames, terms)
+    deviation, hinge_axis = _deviation(types, frames, terms), _hinge(types, frames, terms)
     return SimpleNamespace(
         add=_add(types, frames, terms, deviation),
         energy=_energy(types, frames, terms, deviation),
-        stiffen=_stiffen(types, frames, terms),
-        project=_project(types, frames, terms),
+        stiffen=_stiffen(types, frames, terms, hinge_axis),
+        project=_project(frames, terms, hinge_axis),
     )
 
 
@@ -144,53 +148,54 @@ def _add(types, frames, terms, deviation):
     return add
 
 
-def _stiffen(types, frames, terms):
+def _hinge(types, frames, terms):
+    real = types.real
+
+    @wp.func
+    def hinge_axis(w: int, k: int, plan: Plan, turns: frames, t: terms, scratch: frames):
+        """World axis of column k's hinge into `scratch` (0..2); whether there is a hinge."""
+        a = t.axis[3 * k]
+        b = t.axis[3 * k + 1]
+        c = t.axis[3 * k + 2]
+        p = 9 * plan.parent[k]
+        for r in range(3):
+            scratch[w, r] = (
+                a * turns[w, p + 3 * r] + b * turns[w, p + 3 * r + 1] + c * turns[w, p + 3 * r + 2]
+            )
+        return a * a + b * b + c * c > real(0.0)
+
+    return hinge_axis
+
+
+def _stiffen(types, frames, terms, hinge_axis):
     real = types.real
 
     @wp.func
     def stiffen(w: int, plan: Plan, hinge: real, turns: frames, t: terms, scratch: frames, blocks: frames):
         """Make every turn of a hinge off its axis so costly that the solution has none."""
-        if t.hinges > 0:
-            for k in range(plan.joint.shape[0]):
-                a = t.axis[3 * k]
-                b = t.axis[3 * k + 1]
-                c = t.axis[3 * k + 2]
-                if a * a + b * b + c * c > real(0.0):
-                    p = 9 * plan.parent[k]
-                    d = 12 * plan.block_start[k]
-                    big = hinge * (blocks[w, d] + blocks[w, d + 5] + blocks[w, d + 10])
-                    for r in range(3):
-                        scratch[w, r] = a * turns[w, p + 3 * r] + b * turns[w, p + 3 * r + 1]
-                        scratch[w, r] += c * turns[w, p + 3 * r + 2]
-                    for r in range(3):
-                        blocks[w, d + 5 * r] += big
-                        for i in range(3):
-                            outer = wp.cw_mul(scratch[w, r], scratch[w, i])
-                            blocks[w, d + 4 * r + i] -= wp.cw_mul(big, outer)
+        for k in range(t.hinges):
+            if hinge_axis(w, k, plan, turns, t, scratch):
+                d = 12 * plan.block_start[k]
+                big = hinge * (blocks[w, d] + blocks[w, d + 5] + blocks[w, d + 10])
+                for i in range(9):
+                    outer = wp.cw_mul(scratch[w, i // 3], scratch[w, i % 3])
+                    blocks[w, d + 4 * (i // 3) + i % 3] -= wp.cw_mul(big, outer)
+                for r in range(3):
+                    blocks[w, d + 5 * r] += big
 
     return stiffen
 
 
-def _project(types, frames, terms):
-    real = types.real
-
+def _project(frames, terms, hinge_axis):
     @wp.func
     def project(w: int, plan: Plan, turns: frames, t: terms, scratch: frames, step: frames):
         """Keep the part of each hinge's step that lies along its axis."""
-        if t.hinges > 0:
-            for k in range(plan.joint.shape[0]):
-                a = t.axis[3 * k]
-                b = t.axis[3 * k + 1]
-                c = t.axis[3 * k + 2]
-                if a * a + b * b + c * c > real(0.0):
-                    p = 9 * plan.parent[k]
-                    for r in range(3):
-                        scratch[w, r] = a * turns[w, p + 3 * r] + b * turns[w, p + 3 * r + 1]
-                        scratch[w, r] += c * turns[w, p + 3 * r + 2]
-                    along = wp.cw_mul(scratch[w, 0], step[w, 3 * k])
-                    along += wp.cw_mul(scratch[w, 1], step[w, 3 * k + 1])
-                    along += wp.cw_mul(scratch[w, 2], step[w, 3 * k + 2])
-                    for r in range(3):
-                        step[w, 3 * k + r] = wp.cw_mul(along, scratch[w, r])
+        for k in range(t.hinges):
+            if hinge_axis(w, k, plan, turns, t, scratch):
+                along = wp.cw_mul(scratch[w, 0], step[w, 3 * k])
+                along += wp.cw_mul(scratch[w, 1], step[w, 3 * k + 1])
+                along += wp.cw_mul(scratch[w, 2], step[w, 3 * k + 2])
+                for r in range(3):
+                    step[w, 3 * k + r] = wp.cw_mul(along, scratch[w, r])
 
     return project

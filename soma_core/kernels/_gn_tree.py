@@ -78,6 +78,23 @@ def _times_second(types, frames, constants, scaled):
     real, vec = types.real, types.vec
 
     @wp.func
+    def add_pair(
+        w: int, g: int, n: int, row: int, col: int, t: int, u: int, second: constants, x: frames, out: frames
+    ):
+        """Add ``x_t N_tu`` to block u of `out`; `row` and `col` are the strides of N."""
+        for r in range(3):
+            k = 12 * t + 4 * r
+            x0 = x[w, k]
+            x1 = x[w, k + 1]
+            x2 = x[w, k + 2]
+            x3 = x[w, k + 3]
+            for c in range(4):
+                m = n + col * c
+                first = scaled(second, g, m, x0) + scaled(second, g, m + row, x1)
+                other = scaled(second, g, m + 2 * row, x2) + scaled(second, g, m + 3 * row, x3)
+                out[w, 12 * u + 4 * r + c] += first + other
+
+    @wp.func
     def times_second(w: int, g: int, pairs: Indices, second: constants, x: frames, out: frames):
         """``out = x N``, rows of 3 x 4 blocks; N holds each pair of joints once."""
         for i in range(out.shape[1]):
@@ -85,29 +102,9 @@ def _times_second(types, frames, constants, scaled):
         for k in range(pairs.shape[0] // 2):
             t = pairs[2 * k]
             u = pairs[2 * k + 1]
-            n = 16 * k
-            for r in range(3):
-                x0 = x[w, 12 * t + 4 * r]
-                x1 = x[w, 12 * t + 4 * r + 1]
-                x2 = x[w, 12 * t + 4 * r + 2]
-                x3 = x[w, 12 * t + 4 * r + 3]
-                for c in range(4):
-                    out[w, 12 * u + 4 * r + c] += (
-                        scaled(second, g, n + c, x0) + scaled(second, g, n + 4 + c, x1)
-                        + scaled(second, g, n + 8 + c, x2) + scaled(second, g, n + 12 + c, x3)
-                    )  # fmt: skip
+            add_pair(w, g, 16 * k, 4, 1, t, u, second, x, out)
             if t != u:
-                for r in range(3):
-                    y0 = x[w, 12 * u + 4 * r]
-                    y1 = x[w, 12 * u + 4 * r + 1]
-                    y2 = x[w, 12 * u + 4 * r + 2]
-                    y3 = x[w, 12 * u + 4 * r + 3]
-                    for c in range(4):
-                        m = n + 4 * c
-                        out[w, 12 * t + 4 * r + c] += (
-                            scaled(second, g, m, y0) + scaled(second, g, m + 1, y1)
-                            + scaled(second, g, m + 2, y2) + scaled(second, g, m + 3, y3)
-                        )  # fmt: skip
+                add_pair(w, g, 16 * k, 1, 4, u, t, second, x, out)
 
     return times_second
 

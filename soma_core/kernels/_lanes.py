@@ -32,7 +32,13 @@ def lane_types(scalar: str, lanes: int) -> SimpleNamespace:
     """Element type ``vec`` of `lanes` numbers of type `scalar`, and lane-wise functions."""
     real = getattr(wp, scalar)
     vec = wp.types.vector(lanes, real)
-    width = lanes
+    return SimpleNamespace(
+        real=real, vec=vec, lanes=lanes, **_functions(real, vec, lanes), **_selections(real, vec, lanes)
+    )
+
+
+def _functions(real, vec, width: int) -> dict:
+    """Functions of one lane after the other."""
 
     @wp.func
     def root(x: vec):
@@ -65,6 +71,12 @@ def lane_types(scalar: str, lanes: int) -> SimpleNamespace:
             x[c] = wp.min(x[c], y[c])
         return x
 
+    return {"root": root, "inverse_root": inverse_root, "below": below, "larger": larger, "smaller": smaller}
+
+
+def _selections(real, vec, width: int) -> dict:
+    """Functions that tell lanes apart."""
+
     @wp.func
     def magnitude(x: vec):
         for c in range(width):
@@ -86,19 +98,7 @@ def lane_types(scalar: str, lanes: int) -> SimpleNamespace:
             result += x[c]
         return result
 
-    return SimpleNamespace(
-        total=total,
-        choose=choose,
-        magnitude=magnitude,
-        real=real,
-        vec=vec,
-        lanes=lanes,
-        root=root,
-        inverse_root=inverse_root,
-        below=below,
-        larger=larger,
-        smaller=smaller,
-    )  # fmt: skip
+    return {"magnitude": magnitude, "choose": choose, "total": total}
 
 
 def to_lanes(frames: Tensor, lanes: int) -> Tensor:

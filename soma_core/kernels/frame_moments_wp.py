@@ -18,7 +18,8 @@ _ids = wp.array(dtype=wp.int64)
 def _kernel(scalar: str, lanes: int):
     types = lane_types(scalar, lanes)
     real, frames = types.real, wp.array2d(dtype=types.vec)
-    numbers, gather, second, first = wp.array(dtype=types.real), *_functions(scalar, lanes)
+    numbers, gather = wp.array(dtype=types.real), _gather(types)
+    second, first = _second(types), _first(types)
     table = wp.array3d(dtype=real)
     module = wp.get_module(f"soma_frame_moments_{scalar}_{lanes}")
     module.options["max_unroll"] = 4
@@ -52,10 +53,8 @@ def _kernel(scalar: str, lanes: int):
     return moments
 
 
-def _functions(scalar: str, lanes: int):
-    types = lane_types(scalar, lanes)
-    real, vec, width, frames = types.real, types.vec, lanes, wp.array2d(dtype=types.vec)
-    numbers = wp.array(dtype=real)
+def _gather(types):
+    real, vec, width, frames = types.real, types.vec, types.lanes, wp.array2d(dtype=types.vec)
 
     @wp.func
     def gather(w: int, g: int, offset: int, source: wp.array3d(dtype=real), out: frames):
@@ -68,6 +67,13 @@ def _functions(scalar: str, lanes: int):
                 for c in range(width):
                     x[c] = source[wp.min(g * width + c, last), v, r]
                 out[w, offset + columns * v + r] = x
+
+    return gather
+
+
+def _second(types):
+    real, vec, frames = types.real, types.vec, wp.array2d(dtype=types.vec)
+    numbers = wp.array(dtype=real)
 
     @wp.func
     def second(
@@ -119,6 +125,13 @@ def _functions(scalar: str, lanes: int):
         out[g, k + 8] = z
         out[g, k + 9] = mass
 
+    return second
+
+
+def _first(types):
+    real, vec, frames = types.real, types.vec, wp.array2d(dtype=types.vec)
+    numbers = wp.array(dtype=real)
+
     @wp.func
     def first(
         w: int, g: int, t: int, begin: int, stop: int, count: int, vertex: _ids, weight: numbers,
@@ -140,7 +153,7 @@ def _functions(scalar: str, lanes: int):
                 out[g, 12 * t + 4 * r + 2] += wp.cw_mul(x, c)
                 out[g, 12 * t + 4 * r + 3] += x
 
-    return gather, second, first
+    return first
 
 
 def frame_moments(

@@ -26,16 +26,16 @@ __all__ = ["GaussNewtonPlan", "gauss_newton"]
 def _kernel(scalar: str, lanes: int, *, shared: bool):
     types, tree = lane_types(scalar, lanes), tree_functions(scalar, lanes, shared=shared)
     real, vec, frames, constants = types.real, types.vec, tree.frames, tree.constants
-    assembly, factor = assembly_functions(scalar, lanes, shared=shared), factor_functions(scalar, lanes)
     state, terms, term = _state(scalar, lanes), terms_struct(scalar, lanes), term_functions(scalar, lanes)
-    damp, change, accept = _damp(types, state), _change(types, state), _accept(types, state)
-    energy_change = _energy_change(types, state)
+    change, accept, energy_change = _change(types, state), _accept(types, state), _energy_change(types, state)
+    begin = _begin(tree, state, change)
+    solve, move = _solve_step(scalar, lanes, shared=shared), _move(types, tree, state)
     module = wp.get_module(f"soma_gauss_newton_{scalar}_{lanes}_{'one' if shared else 'each'}")
     # Unrolled, the kernel takes three times as long to compile and is no faster.
     module.options.update({"enable_backward": False, "max_unroll": 2})
 
     @wp.kernel(module=module, enable_backward=False)
-    def solve(
+    def fit(
         plan: Plan, s: state, iterations: int, start_damping: real, lower: real, higher: real,
         most: real, longest: real, hinge: real, t: terms, second: constants, offsets: constants,
         threshold: frames, target: frames, relative: frames, hips: frames, accepted: frames,
@@ -43,45 +43,15 @@ def _kernel(scalar: str, lanes: int, *, shared: bool):
     ):  # fmt: skip
         w = wp.tid()
         for g in range(w, target.shape[0], s.turns.shape[0]):
-            for i in range(relative.shape[1]):
-                s.relative[w, i] = relative[g, i]
-                s.trial_relative[w, i] = relative[g, i]
-            for r in range(3):
-                s.hips[w, r] = hips[g, r]
-            tree.walk(w, g, plan.parents, offsets, s.relative, s.hips, s.turns, s.places)
-            change(w, plan, s.turns, s.places, s)
-            for i in range(target.shape[1]):
-                s.change[w, i] = s.trial[w, i]
-            tree.times_second(w, g, plan.pairs, second, s.change, s.residual)
-            for i in range(target.shape[1]):
-                s.residual[w, i] -= target[g, i]
+            begin(w, g, plan, second, offsets, target, relative, hips, s)
             damping = vec(start_damping)
             count = vec(real(0.0))
             energy = vec(real(0.0))
             # A lane rests once it has converged: what becomes of a frame does not depend on its neighbours.
             moving = vec(real(1.0))
             for _ in range(iterations):
-                assembly.moments(w, g, plan, second, s.turns, s.places, s.column, s.blocks, s.root)
-                assembly.finish(w, plan, s.blocks)
-                assembly.forces(w, plan, s.turns, s.places, s.residual, s.spread, s.force, s.slope)
-                before = term.add(w, g, plan, s.relative, s.turns, t, s.scratch, s.blocks, s.slope)
-                term.stiffen(w, plan, hinge, s.turns, t, s.scratch, s.blocks)
-                damp(w, plan, damping, s)
-                factor.factorise(w, plan, s.blocks, s.carry, s.last, s.inverse)
-                factor.solve(w, plan, s.blocks, s.carry, s.last, s.inverse, s.slope)
-                term.project(w, plan, s.turns, t, s.scratch, s.slope)
-                for k in range(plan.joint.shape[0]):
-                    x = -s.slope[w, 3 * k]
-                    y = -s.slope[w, 3 * k + 1]
-                    z = -s.slope[w, 3 * k + 2]
-                    length = types.root(wp.cw_mul(x, x) + wp.cw_mul(y, y) + wp.cw_mul(z, z))
-                    short = wp.cw_div(vec(longest), types.larger(length, vec(longest)))
-                    tree.retract(
-                        w, plan.joint[k], plan.parent[k], wp.cw_mul(x, short), wp.cw_mul(y, short),
-                        wp.cw_mul(z, short), s.turns, s.relative, s.trial_relative,
-                    )  # fmt: skip
-                for r in range(3):
-                    s.trial_hips[w, r] = s.hips[w, r] - s.slope[w, 3 * plan.joint.shape[0] + r]
+                before = solve(w, g, plan, damping, hinge, second, t, s)
+                move(w, plan, longest, s)
                 tree.walk(
                     w, g, plan.parents, offsets, s.trial_relative, s.trial_hips, s.trial_turns, s.trial_places
                 )
@@ -95,7 +65,8 @@ def _kernel(scalar: str, lanes: int, *, shared: bool):
                 energy = types.choose(moving, gained, energy)
                 damping = wp.cw_mul(damping, vec(higher) + (lower - higher) * better)
                 damping = types.smaller(damping, vec(most))
-                moving -= wp.cw_mul(moving, types.below(types.magnitude(gained) - threshold[g, 0], real(0.0)))
+                small = types.below(types.magnitude(gained) - threshold[g, 0], real(0.0))
+                moving -= wp.cw_mul(moving, small)
                 if types.total(moving) == real(0.0):
                     break
             for i in range(relative.shape[1]):
@@ -105,7 +76,75 @@ def _kernel(scalar: str, lanes: int, *, shared: bool):
             accepted[g, 0] = count
             last_change[g, 0] = energy
 
+    return fit
+
+
+def _begin(tree, state, change):
+    frames, constants = tree.frames, tree.constants
+
+    @wp.func
+    def begin(
+        w: int, g: int, plan: Plan, second: constants, offsets: constants, target: frames,
+        relative: frames, hips: frames, s: state,
+    ):  # fmt: skip
+        """State of a group of frames at its start, with ``P = G N - R`` in `residual`."""
+        for i in range(relative.shape[1]):
+            s.relative[w, i] = relative[g, i]
+            s.trial_relative[w, i] = relative[g, i]
+        for r in range(3):
+            s.hips[w, r] = hips[g, r]
+        tree.walk(w, g, plan.parents, offsets, s.relative, s.hips, s.turns, s.places)
+        change(w, plan, s.turns, s.places, s)
+        tree.times_second(w, g, plan.pairs, second, s.trial, s.residual)
+        for i in range(target.shape[1]):
+            s.residual[w, i] -= target[g, i]
+
+    return begin
+
+
+def _solve_step(scalar: str, lanes: int, *, shared: bool):
+    types, tree = lane_types(scalar, lanes), tree_functions(scalar, lanes, shared=shared)
+    assembly, factor = assembly_functions(scalar, lanes, shared=shared), factor_functions(scalar, lanes)
+    state, terms, term = _state(scalar, lanes), terms_struct(scalar, lanes), term_functions(scalar, lanes)
+    real, vec, constants, damp = types.real, types.vec, tree.constants, _damp(types, state)
+
+    @wp.func
+    def solve(w: int, g: int, plan: Plan, damping: vec, hinge: real, second: constants, t: terms, s: state):
+        """Assemble, damp, factorise and solve: minus the step in `slope`; returns the energy of the terms."""
+        assembly.moments(w, g, plan, second, s.turns, s.places, s.column, s.blocks, s.root)
+        assembly.finish(w, plan, s.blocks)
+        assembly.forces(w, plan, s.turns, s.places, s.residual, s.spread, s.force, s.slope)
+        energy = term.add(w, g, plan, s.relative, s.turns, t, s.scratch, s.blocks, s.slope)
+        term.stiffen(w, plan, hinge, s.turns, t, s.scratch, s.blocks)
+        damp(w, plan, damping, s)
+        factor.factorise(w, plan, s.blocks, s.carry, s.last, s.inverse)
+        factor.solve(w, plan, s.blocks, s.carry, s.last, s.inverse, s.slope)
+        term.project(w, plan, s.turns, t, s.scratch, s.slope)
+        return energy
+
     return solve
+
+
+def _move(types, tree, state):
+    real, vec = types.real, types.vec
+
+    @wp.func
+    def move(w: int, plan: Plan, longest: real, s: state):
+        """The trial pose: every joint turned by its step, no further than `longest`, and the Hips shifted."""
+        for k in range(plan.joint.shape[0]):
+            x = -s.slope[w, 3 * k]
+            y = -s.slope[w, 3 * k + 1]
+            z = -s.slope[w, 3 * k + 2]
+            length = types.root(wp.cw_mul(x, x) + wp.cw_mul(y, y) + wp.cw_mul(z, z))
+            short = wp.cw_div(vec(longest), types.larger(length, vec(longest)))
+            tree.retract(
+                w, plan.joint[k], plan.parent[k], wp.cw_mul(x, short), wp.cw_mul(y, short),
+                wp.cw_mul(z, short), s.turns, s.relative, s.trial_relative,
+            )  # fmt: skip
+        for r in range(3):
+            s.trial_hips[w, r] = s.hips[w, r] - s.slope[w, 3 * plan.joint.shape[0] + r]
+
+    return move
 
 
 @functools.cache
@@ -279,7 +318,7 @@ def _terms(given: tuple[Mapping[str, Tensor], Tensor] | None, scalar: str, lanes
 
     def part_of(part: slice):
         terms = struct()
-        terms.count, terms.hinges = count, int(bool((hinged != 0).any()))
+        terms.count, terms.hinges = count, len(hinged) if bool((hinged != 0).any()) else 0
         terms.column = wp.from_torch(kept[0], dtype=wp.int32)
         terms.stiffness, terms.free = (wp.from_torch(one) for one in kept[1])
         terms.axis = wp.from_torch(kept[3])

@@ -17,10 +17,9 @@ _ids = wp.array(dtype=wp.int64)
 @functools.cache
 def _kernel(scalar: str, lanes: int):
     types = lane_types(scalar, lanes)
-    real, vec, width = types.real, types.vec, lanes
-    frames = wp.array2d(dtype=vec)
+    real, width, frames = types.real, lanes, wp.array2d(dtype=types.vec)
     module = wp.get_module(f"soma_target_moments_{scalar}_{lanes}")
-    gather = _gather(types)
+    gather, joint_moments = _gather(types), _joint_moments(types)
 
     @wp.kernel(module=module, enable_backward=False)
     def moments(
@@ -34,62 +33,77 @@ def _kernel(scalar: str, lanes: int):
             for r in range(3):
                 origin[g, r] = points[w, 3 * wp.int32(vertex[0]) + r]
             for t in range(start.shape[0] - 1):
-                first = wp.int32(start[t])
-                v = 3 * wp.int32(vertex[first])
-                # Sums of steps from a vertex nearby: float32 then loses nothing in long sums.
-                c0 = points[w, v]
-                c1 = points[w, v + 1]
-                c2 = points[w, v + 2]
-                x0 = vec(real(0.0))
-                x1 = vec(real(0.0))
-                x2 = vec(real(0.0))
-                x3 = vec(real(0.0))
-                y0 = vec(real(0.0))
-                y1 = vec(real(0.0))
-                y2 = vec(real(0.0))
-                y3 = vec(real(0.0))
-                z0 = vec(real(0.0))
-                z1 = vec(real(0.0))
-                z2 = vec(real(0.0))
-                z3 = vec(real(0.0))
-                for e in range(first, wp.int32(start[t + 1])):
-                    v = 3 * wp.int32(vertex[e])
-                    x = weight[e] * (points[w, v] - c0)
-                    y = weight[e] * (points[w, v + 1] - c1)
-                    z = weight[e] * (points[w, v + 2] - c2)
-                    b0 = local[e, 0]
-                    b1 = local[e, 1]
-                    b2 = local[e, 2]
-                    x0 += b0 * x
-                    x1 += b1 * x
-                    x2 += b2 * x
-                    x3 += x
-                    y0 += b0 * y
-                    y1 += b1 * y
-                    y2 += b2 * y
-                    y3 += y
-                    z0 += b0 * z
-                    z1 += b1 * z
-                    z2 += b2 * z
-                    z3 += z
-                c0 -= origin[g, 0]
-                c1 -= origin[g, 1]
-                c2 -= origin[g, 2]
-                k = 12 * t
-                out[g, k] = x0 + mean[t, 0] * c0
-                out[g, k + 1] = x1 + mean[t, 1] * c0
-                out[g, k + 2] = x2 + mean[t, 2] * c0
-                out[g, k + 3] = x3 + mean[t, 3] * c0
-                out[g, k + 4] = y0 + mean[t, 0] * c1
-                out[g, k + 5] = y1 + mean[t, 1] * c1
-                out[g, k + 6] = y2 + mean[t, 2] * c1
-                out[g, k + 7] = y3 + mean[t, 3] * c1
-                out[g, k + 8] = z0 + mean[t, 0] * c2
-                out[g, k + 9] = z1 + mean[t, 1] * c2
-                out[g, k + 10] = z2 + mean[t, 2] * c2
-                out[g, k + 11] = z3 + mean[t, 3] * c2
+                joint_moments(w, g, t, start, vertex, weight, local, mean, points, origin, out)
 
     return moments
+
+
+def _joint_moments(types):
+    real, vec, frames = types.real, types.vec, wp.array2d(dtype=types.vec)
+
+    @wp.func
+    def joint_moments(
+        w: int, g: int, t: int, start: _ids, vertex: _ids, weight: wp.array(dtype=real),
+        local: wp.array2d(dtype=real), mean: wp.array2d(dtype=real), points: frames, origin: frames,
+        out: frames,
+    ):  # fmt: skip
+        """``R`` of one joint, about the origin of the frames."""
+        first = wp.int32(start[t])
+        v = 3 * wp.int32(vertex[first])
+        # Sums of steps from a vertex nearby: float32 then loses nothing in long sums.
+        c0 = points[w, v]
+        c1 = points[w, v + 1]
+        c2 = points[w, v + 2]
+        x0 = vec(real(0.0))
+        x1 = vec(real(0.0))
+        x2 = vec(real(0.0))
+        x3 = vec(real(0.0))
+        y0 = vec(real(0.0))
+        y1 = vec(real(0.0))
+        y2 = vec(real(0.0))
+        y3 = vec(real(0.0))
+        z0 = vec(real(0.0))
+        z1 = vec(real(0.0))
+        z2 = vec(real(0.0))
+        z3 = vec(real(0.0))
+        for e in range(first, wp.int32(start[t + 1])):
+            v = 3 * wp.int32(vertex[e])
+            x = weight[e] * (points[w, v] - c0)
+            y = weight[e] * (points[w, v + 1] - c1)
+            z = weight[e] * (points[w, v + 2] - c2)
+            b0 = local[e, 0]
+            b1 = local[e, 1]
+            b2 = local[e, 2]
+            x0 += b0 * x
+            x1 += b1 * x
+            x2 += b2 * x
+            x3 += x
+            y0 += b0 * y
+            y1 += b1 * y
+            y2 += b2 * y
+            y3 += y
+            z0 += b0 * z
+            z1 += b1 * z
+            z2 += b2 * z
+            z3 += z
+        c0 -= origin[g, 0]
+        c1 -= origin[g, 1]
+        c2 -= origin[g, 2]
+        k = 12 * t
+        out[g, k] = x0 + mean[t, 0] * c0
+        out[g, k + 1] = x1 + mean[t, 1] * c0
+        out[g, k + 2] = x2 + mean[t, 2] * c0
+        out[g, k + 3] = x3 + mean[t, 3] * c0
+        out[g, k + 4] = y0 + mean[t, 0] * c1
+        out[g, k + 5] = y1 + mean[t, 1] * c1
+        out[g, k + 6] = y2 + mean[t, 2] * c1
+        out[g, k + 7] = y3 + mean[t, 3] * c1
+        out[g, k + 8] = z0 + mean[t, 0] * c2
+        out[g, k + 9] = z1 + mean[t, 1] * c2
+        out[g, k + 10] = z2 + mean[t, 2] * c2
+        out[g, k + 11] = z3 + mean[t, 3] * c2
+
+    return joint_moments
 
 
 def _gather(types):

@@ -122,7 +122,7 @@ def _check_count(
             str(sequence.path),
             got=f"{count} vertices",
             expected=f"one of {known} for backend {layer.backend!r}",
-            fix="Export every vertex of the mesh once: not merged, not split at texture seams.",
+            fix="Pass backend=NAME of the model that made them; export each vertex once, neither merged nor split.",
         )
     if topology == "canonical" and lod == "mid" and count != counts["mid"]:
         raise InputError(

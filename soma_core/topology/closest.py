@@ -35,6 +35,12 @@ class ClosestFaces:
         proposed = closest_faces(
             (points - centre) / scale, (self._vertices - centre) / scale, self._triangles
         )
+        return self.nearest_touching(points, proposed)
+
+    def nearest_touching(self, points: np.ndarray, proposed: np.ndarray) -> np.ndarray:
+        """Closest face of each point among those that touch the face proposed for it; (m,) int64."""
+        centre = self._vertices.mean(0)
+        scale = float(np.abs(self._vertices - centre).max()) or 1.0
         query, face = self._touching(proposed)
         closest = closest_point_on_triangle(points[query], self._vertices[self._triangles[face]])
         squared = ((points[query] - closest) ** 2).sum(1)
