@@ -122,7 +122,7 @@ def _check_count(
             str(sequence.path),
             got=f"{count} vertices",
             expected=f"one of {known} for backend {layer.backend!r}",
-            fix="Pass backend=NAME of the model that made them; export each vertex once, neither merged nor split.",
+            fix="Pass backend=NAME of their model; export each vertex once, neither merged nor split.",
         )
     if topology == "canonical" and lod == "mid" and count != counts["mid"]:
         raise InputError(
