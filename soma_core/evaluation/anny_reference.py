@@ -9,14 +9,13 @@ without normal offsets, and our reposing to the bind pose before skinning.
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import torch
 from omegaconf import DictConfig
 from torch import Tensor
 
-from soma_core.errors import InputError
+from soma_core.evaluation.anny_package import anny_package_model
 from soma_core.evaluation.random_poses import random_axis_angles
 from soma_core.evaluation.report import Figure, Report, distance_figures
 from soma_core.geometry.rotations import axis_angle_to_matrix
@@ -31,20 +30,6 @@ _PHENOTYPES = ("gender", "age", "muscle", "weight", "height", "proportions")
 
 _MEAN_MM = 1.0
 _EXPLAINED_MM = 0.01
-
-
-def _package_model() -> Any:
-    try:
-        import anny
-    except ImportError as error:
-        raise InputError(
-            "experiment.backend",
-            got="no anny package",
-            expected="the anny package",
-            fix="pip install anny==0.6.2",
-        ) from error
-    model = anny.Anny(rig="soma", topology="soma", phenotypes="all", pose_parameterization="local-ref")
-    return model.to(torch.float64)
 
 
 def _from_hips(points: Tensor, transforms: Tensor) -> Tensor:
@@ -66,7 +51,7 @@ def _their_identity(identity: Identity, found: dict[str, Tensor], rest: Tensor) 
 def run(config: DictConfig) -> Report:
     """Compare `config.experiment.count` random identities in as many random poses, in float64."""
     count = config.experiment.count
-    model = _package_model()
+    model = anny_package_model(rig="soma", topology="soma", dtype=torch.float64)
     layer = SomaLayer("anny", dtype=torch.float64, exact=True)
     random = np.random.default_rng(config.seed)
     drawn = sample_parameters(layer.spec, count, random, skip_groups={"local_changes"})

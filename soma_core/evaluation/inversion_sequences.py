@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from soma_core.errors import InputError
+from soma_core.evaluation.anny_package import anny_package_model
 from soma_core.evaluation.random_poses import joint_spread, smooth_axis_angles
 from soma_core.geometry.rotations import axis_angle_to_matrix
 from soma_core.io import read_motion
@@ -126,7 +126,7 @@ def anny_native_vertices(params: Mapping[str, float], count: int, random: np.ran
     Raises:
         InputError: the anny package is not installed.
     """
-    model = _anny_model()
+    model = anny_package_model(rig="anny", topology="anny", dtype=torch.float32)
     turns = smooth_axis_angles(_bone_spread(model.bone_labels), count, random)
     deltas = torch.eye(4).repeat(count, len(model.bone_labels), 1, 1)
     deltas[..., :3, :3] = axis_angle_to_matrix(torch.as_tensor(turns)).float()
@@ -134,19 +134,6 @@ def anny_native_vertices(params: Mapping[str, float], count: int, random: np.ran
     deltas[:, 0, :3, 3] = torch.as_tensor(drift).float()
     phenotypes = {name: torch.full((count,), value) for name, value in params.items()}
     return model(pose_parameters=deltas, phenotype_kwargs=phenotypes)["vertices"]
-
-
-def _anny_model() -> Any:
-    try:
-        import anny
-    except ImportError as error:
-        raise InputError(
-            "experiment.backend",
-            got="no anny package",
-            expected="the anny package",
-            fix="pip install anny==0.6.2",
-        ) from error
-    return anny.Anny(rig="anny", topology="anny", phenotypes="all").to(torch.float32)
 
 
 def _bone_spread(names: Sequence[str]) -> np.ndarray:

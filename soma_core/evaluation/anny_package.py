@@ -1,0 +1,34 @@
+"""The anny package's own model, an implementation by other people."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+
+from soma_core.errors import InputError
+
+__all__ = ["anny_package_model"]
+
+
+def anny_package_model(*, rig: str, topology: str, dtype: torch.dtype) -> Any:
+    """The package's model with all phenotypes; the first one built on a machine takes about a minute.
+
+    Args:
+        rig, topology: ``anny``, its own, or ``soma``, its copy of the canonical ones.
+        dtype: of its tensors.
+
+    Raises:
+        InputError: the anny package is not installed.
+    """
+    try:
+        import anny
+    except ImportError as error:
+        raise InputError(
+            "experiment.backend",
+            got="no anny package",
+            expected="the anny package",
+            fix="pip install anny==0.6.2",
+        ) from error
+    options = {"phenotypes": "all", "pose_parameterization": "local-ref"}
+    return anny.Anny(rig=rig, topology=topology, **options).to(dtype)
