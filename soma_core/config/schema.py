@@ -157,7 +157,7 @@ class AutogradChoice:
     iterations: int = 100
     rate: float = 0.02
     shift_rate: float = 0.002
-    final: float = 0.02
+    final: float = 0.005
     regions: dict[str, float] = field(default_factory=dict)
     loss: str = "moments"
 

@@ -61,7 +61,7 @@ class AutogradOptions:
     iterations: int = 100
     rate: float = 0.02
     shift_rate: float = 0.002
-    final: float = 0.02
+    final: float = 0.005
     regions: Mapping[str, float] = field(default_factory=dict)
     loss: Literal["moments", "vertices"] = "moments"
     penalty: Callable[[Tensor], Tensor] | None = None
