@@ -58,7 +58,7 @@ def refuse_unit_error(scale: Tensor) -> None:
         if 0.5 < typical / factor < 2:
             raise InputError(
                 "vertices",
-                got=f"bodies {typical:.3g} times the size of their identity",
+                got=f"bodies {typical:.4g} times the size of their identity",
                 expected="metres on the canonical topology, or the backend's own unit",
                 fix=f"Multiply the vertices by {1 / factor:g}.",
             )

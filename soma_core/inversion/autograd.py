@@ -143,6 +143,9 @@ class Autograd(torch.nn.Module):
                     fix="Correct it.",
                 )
         self.regions = {name: torch.as_tensor(regions[name]) for name in options.regions}
+        with torch.inference_mode(mode=False):
+            for name in ("joints", "variables", "parents"):
+                self.register_buffer(name, _usable(getattr(solver, name)), persistent=False)
 
     def weighted(self, weights: Tensor) -> Tensor:
         """Vertex weights (..., v) times the factors of their regions."""
@@ -174,13 +177,13 @@ class Autograd(torch.nn.Module):
 
     def _by_moments(self, problem: Problem, start: Pose) -> _Loss:
         """Mean squared distance [m^2] beyond that of the start, exact for any step."""
-        solver, rest, joints = self.solver, problem.rest, self.solver.joints
+        solver, rest, joints = self.solver, problem.rest, self.joints
         second, mass = solver.dense(rest.second), rest.own[..., 3, 3].sum(1)
         turns, places = solver.walk(start, rest.offsets)
         residual = solver.gradient(turns, places, second, problem.target)
 
         def loss(turned: Tensor, shift: Tensor) -> Tensor:
-            above = turned[:, solver.parents]
+            above = turned[:, self.parents]
             placed = self.animation.kinematics.positions(above, rest.offsets, shift)
             change = torch.cat((turned - turns, (placed - places)[..., None]), -1)[:, joints]
             product = solver.times_second(change, second)
@@ -208,7 +211,7 @@ class Autograd(torch.nn.Module):
 
     def _descend(self, start: Pose, offsets: Tensor, loss: _Loss) -> Pose:
         """Adam on the first two columns of every variable turn and on the translation."""
-        options, n = self.options, self.solver.variables
+        options, n = self.options, self.variables
         turns, _ = self.solver.walk(start, offsets)
         six, shift = turns[:, n, :, :2].clone().requires_grad_(), start.translation.clone().requires_grad_()
         groups = [{"params": [six], "lr": options.rate}, {"params": [shift], "lr": options.shift_rate}]
@@ -240,8 +243,8 @@ class Autograd(torch.nn.Module):
 
     def _relative(self, start: Pose, turns: Tensor) -> Tensor:
         """Relative rotations (F, J, 3, 3) of turns; joints that carry no weight follow their parent."""
-        n = self.solver.variables
-        above = turns[:, self.solver.parents[n]]
+        n = self.variables
+        above = turns[:, self.parents[n]]
         return start.relative.index_copy(1, n, above.transpose(-1, -2) @ turns[:, n])
 
 

@@ -93,7 +93,7 @@ class PoseInversion(torch.nn.Module):
         *,
         stages: Sequence[Stage] = ("procrustes", "gauss_newton"),
         iterations: int = 12,
-        tolerance: float = 5e-5,
+        tolerance: float = 2e-5,
         analytical: AnalyticalOptions | None = None,
         autograd: AutogradOptions | None = None,
         robust: float | None = None,

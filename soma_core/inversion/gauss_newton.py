@@ -24,7 +24,7 @@ from soma_core.inversion.structure import MomentStructure
 
 __all__ = ["GaussNewton"]
 
-_START_DAMPING = 1e-3
+_START_DAMPING = 1e-4
 _LOWER, _RAISE, _MOST_DAMPING = 0.2, 8.0, 1e6
 """Levenberg damping, relative to the diagonal: start, factors after a good and a bad step, largest value."""
 

@@ -52,7 +52,7 @@ class LadderOptions:
 
     stages: Sequence[Stage] = ("procrustes", "gauss_newton")
     iterations: int = 12
-    tolerance: float = 5e-5
+    tolerance: float = 2e-5
     analytical: AnalyticalOptions = field(default_factory=AnalyticalOptions)
     autograd: AutogradOptions = field(default_factory=AutogradOptions)
     robust: float | None = None
