@@ -147,6 +147,15 @@ def test_a_penalty_leaves_outliers_aside():
     assert kept < 5
 
 
+def test_a_fit_may_be_made_in_inference_mode(layer):
+    identity = layer.identity()
+    vertices = layer.pose(identity, *real().poses(1, dtype=torch.float32)).vertices
+    with torch.inference_mode():
+        found = PoseInversion(layer, stages=("transfer", "autograd"))(vertices, identity)
+    expected = PoseInversion(layer, stages=("transfer", "autograd"))(vertices, identity)
+    torch.testing.assert_close(found.rotations, expected.rotations)
+
+
 def test_a_region_that_counts_more_is_met_better():
     case = Case(real())
     # A larger body, which no pose explains: regions compete.
