@@ -6,12 +6,13 @@ import hashlib
 import logging
 import os
 import tempfile
-import zipfile
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
 import numpy as np
 
+from soma_core.errors import AssetError
+from soma_core.npz import open_npz_file
 from soma_core.paths import cache_dir
 
 __all__ = ["atomic_write", "cached_arrays", "content_key", "file_sha256"]
@@ -60,12 +61,11 @@ def atomic_write(path: Path, write: Callable[[Path], None]) -> None:
 
 def _read(path: Path) -> dict[str, np.ndarray] | None:
     try:
-        # NumPy leaves a damaged archive open, so the file is opened here.
-        with open(path, "rb") as stream, np.load(stream, allow_pickle=False) as file:
-            return {name: file[name] for name in file.files}
-    except FileNotFoundError:
-        return None
-    except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
+        if not path.exists():
+            return None
+        with open_npz_file(path) as file:
+            return {name: file.read(name) for name in file.names}
+    except (OSError, ValueError, AssetError) as error:
         _log.warning("cache file %s is unreadable (%s); building it again", path, error)
         return None
 

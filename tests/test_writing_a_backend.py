@@ -212,6 +212,7 @@ def _messages(*modules: str) -> Iterator[str]:
 
 BACKEND = (
     *(f"plugin/{name}.py" for name in ("declaration", "hooks", "registry", "configs", "options")),
+    "files.py",
     *(f"topology/{name}.py" for name in ("wrap_pair", "correspondence", "transfer")),
     "config/refusals.py",
 )

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from soma_core.errors import AssetError
-from soma_core.io.npz_fields import refuse_missing
+from soma_core.files import refuse_unreadable
 
 __all__ = ["read_mesh_vertices"]
 
@@ -17,6 +17,7 @@ _PLY_TYPES = {
     "double": "f8", "int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4",
     "uint32": "u4", "float32": "f4", "float64": "f8",
 }  # fmt: skip
+_MOST_BYTES = 256 * 2**20
 _PLY_ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
 
 
@@ -28,10 +29,10 @@ def read_mesh_vertices(path: Path) -> np.ndarray:
     Raises:
         AssetError: the file is missing, damaged or holds no vertices.
     """
-    refuse_missing(path)
+    refuse_unreadable(path, most_bytes=_MOST_BYTES)
     try:
         vertices = _read_ply(path) if path.suffix.lower() == ".ply" else _read_obj(path)
-    except (ValueError, IndexError, TypeError) as error:
+    except (ValueError, IndexError, TypeError, KeyError, OverflowError, MemoryError) as error:
         raise AssetError(path, cause=f"no readable mesh ({error})", fix="Export the mesh again.") from error
     if not len(vertices):
         raise AssetError(path, cause="holds no vertices", fix="Export the mesh again.")
@@ -79,10 +80,12 @@ def _parse_header(text: str) -> tuple[str, list[_Element]]:
             order = _PLY_ORDERS.get(words[1])
         elif words[:1] == ["element"]:
             elements.append(_Element(words[1], int(words[2])))
+            if not 0 <= elements[-1].count <= _MOST_BYTES:
+                raise ValueError(f"{words[2]:.20} of element {words[1]:.20}")
         elif words[:2] == ["property", "list"]:
             elements[-1].has_list = True
         elif words[:1] == ["property"]:
-            elements[-1].properties.append((words[2], _PLY_TYPES.get(words[1], words[1])))
+            elements[-1].properties.append((words[2], _PLY_TYPES[words[1]]))
     if order is None:
         raise ValueError("no known PLY format")
     return order, elements

@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-import zipfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
 
-from soma_core.errors import AssetError, InputError
+from soma_core.errors import InputError
+from soma_core.npz import NpzFile, open_npz_file
 
-__all__ = ["NpzFields", "check_rotations", "open_npz", "refuse_missing"]
+__all__ = ["NpzFields", "check_rotations", "open_npz"]
 
 ORTHONORMAL_TOLERANCE = 1e-3
 """Largest entry of |RᵀR - I| accepted; half-precision files reach 5e-4, a scaled matrix does not pass."""
@@ -20,17 +20,17 @@ ORTHONORMAL_TOLERANCE = 1e-3
 class NpzFields:
     """The named arrays of one NPZ file, read on demand and never unpickled."""
 
-    def __init__(self, path: Path, arrays: np.lib.npyio.NpzFile) -> None:
-        self.path = path
-        self._arrays = arrays
+    def __init__(self, file: NpzFile) -> None:
+        self.path = file.path
+        self._file = file
 
     @property
     def names(self) -> tuple[str, ...]:
         """Keys of the file in the order they were stored."""
-        return tuple(self._arrays.files)
+        return self._file.names
 
     def __contains__(self, key: str) -> bool:
-        return key in self._arrays.files
+        return key in self._file.names
 
     def refuse(self, key: str, *, got: object, expected: object, fix: str) -> InputError:
         """Make the error that names this file and `key`."""
@@ -46,13 +46,13 @@ class NpzFields:
                 fix="Write the file again with that key.",
             )
         try:
-            return self._arrays[key]
+            return self._file.read(key)
         except ValueError as error:
             raise self.refuse(
                 key,
                 got=f"an unreadable array ({error})",
                 expected="a plain numeric or text array",
-                fix="Write the file again without Python objects.",
+                fix="Fetch it again, or write it without Python objects.",
             ) from error
 
     def numbers(self, key: str, shape: tuple[int | str, ...]) -> np.ndarray:
@@ -97,7 +97,9 @@ class NpzFields:
                 key, got=f"dtype {array.dtype}", expected="text", fix="Store the text as a string array."
             )
         values = array.reshape(-1).tolist()
-        return tuple(value.decode() if isinstance(value, bytes) else value for value in values)
+        return tuple(
+            value.decode(errors="replace") if isinstance(value, bytes) else value for value in values
+        )
 
     def text(self, key: str, default: str | None = None) -> str:
         """One text under `key`, or `default` where the key is absent and a default is given."""
@@ -111,30 +113,6 @@ class NpzFields:
         return values[0]
 
 
-def refuse_missing(path: Path) -> bytes:
-    """Raise for a file that is missing or a git-LFS pointer; return its first bytes."""
-    if not path.is_file():
-        raise AssetError(path, cause="no such file", fix="Check the path.")
-    with open(path, "rb") as stream:
-        head = stream.read(64)
-    if head.startswith(b"version https://git-lfs"):
-        raise AssetError(
-            path,
-            cause="this is a git-LFS pointer, not the file itself",
-            fix="Run `git lfs install && git lfs pull` in the repository it came from.",
-        )
-    return head
-
-
-def _refuse_unreadable(path: Path) -> None:
-    """Raise for a file that is missing, a git-LFS pointer or no ZIP archive."""
-    head = refuse_missing(path)
-    if not zipfile.is_zipfile(path):
-        raise AssetError(
-            path, cause=f"not an NPZ file (it starts with {head[:8]!r})", fix="Give a complete .npz file."
-        )
-
-
 @contextmanager
 def open_npz(path: str | Path) -> Iterator[NpzFields]:
     """Open an NPZ file for checked reading.
@@ -142,13 +120,8 @@ def open_npz(path: str | Path) -> Iterator[NpzFields]:
     Raises:
         AssetError: the file is missing, truncated, a git-LFS pointer or not an NPZ.
     """
-    path = Path(path)
-    _refuse_unreadable(path)
-    try:
-        with np.load(path, allow_pickle=False) as arrays:
-            yield NpzFields(path, arrays)
-    except (zipfile.BadZipFile, EOFError) as error:
-        raise AssetError(path, cause=f"damaged NPZ file ({error})", fix="Fetch or write it again.") from error
+    with open_npz_file(path, fix="Give a complete .npz file.") as file:
+        yield NpzFields(file)
 
 
 def check_rotations(argument: str, matrices: np.ndarray) -> None:

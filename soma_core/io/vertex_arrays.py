@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import math
 import zipfile
 import zlib
-from dataclasses import dataclass
 from pathlib import Path
 from typing import IO
 
@@ -15,40 +13,17 @@ from soma_core.errors import AssetError, InputError, SomaError
 from soma_core.io.npz_fields import NpzFields, open_npz
 from soma_core.io.soma_npz import METRES_PER_UNIT
 from soma_core.io.vertex_sequence import UpAxis, VertexSequence
+from soma_core.npz import ArrayHeader, read_array_header
 
 __all__ = ["ArraySequence", "open_npy", "open_npz_vertices"]
 
 _KEY = "vertices"
 _UNITS = METRES_PER_UNIT | {"m": 1.0, "cm": 0.01, "mm": 0.001}
 _AXES: dict[str, UpAxis] = {"Y": "+y", "Z": "+z"}
-_DAMAGE = (ValueError, EOFError, OSError, zipfile.BadZipFile, zlib.error)
-
-
-@dataclass(frozen=True, kw_only=True)
-class _Header:
-    """Layout of one stored array: where its numbers begin and what they are."""
-
-    shape: tuple[int, ...]
-    dtype: np.dtype
-    fortran: bool
-    begin: int
-
-    @property
-    def holds_vertices(self) -> bool:
-        """Whether the array is numbers of shape (frames, vertices, 3)."""
-        return len(self.shape) == 3 and self.shape[2] == 3 and self.dtype.kind in "fiu"
-
-
-def _read_header(stream: IO[bytes]) -> _Header:
-    """Read the header of an NPY stream; ValueError where it is none."""
-    version = np.lib.format.read_magic(stream)
-    if version == (1, 0):
-        shape, fortran, dtype = np.lib.format.read_array_header_1_0(stream)
-    elif version == (2, 0):
-        shape, fortran, dtype = np.lib.format.read_array_header_2_0(stream)
-    else:
-        raise ValueError(f"NPY version {version}")
-    return _Header(shape=shape, dtype=dtype, fortran=fortran, begin=stream.tell())
+_DAMAGE = (ValueError, EOFError, OSError, RuntimeError, MemoryError, zipfile.BadZipFile, zlib.error)
+_ARCHIVE_DAMAGE = (EOFError, OSError, RuntimeError, zipfile.BadZipFile, zlib.error)
+_MOST_VERTICES = 4_000_000
+"""Bounds the memory of one frame."""
 
 
 class ArraySequence(VertexSequence):
@@ -58,7 +33,7 @@ class ArraySequence(VertexSequence):
         self,
         path: Path,
         stream: IO[bytes],
-        header: _Header,
+        header: ArrayHeader,
         *,
         fps: float | None = None,
         metres: float | None = None,
@@ -99,9 +74,9 @@ def open_npy(path: Path) -> ArraySequence:
     """
     stream = open(path, "rb")  # noqa: SIM115 - the sequence closes it
     try:
-        header = _read_header(stream)
+        header = read_array_header(stream)
         _check_layout(path, "the array", header)
-        missing = header.begin + math.prod(header.shape) * header.dtype.itemsize - path.stat().st_size
+        missing = header.begin + header.byte_count - path.stat().st_size
         if missing > 0:
             raise _damaged(path, f"{missing} bytes are missing")
         return ArraySequence(path, stream, header)
@@ -133,7 +108,7 @@ def open_npz_vertices(path: Path) -> ArraySequence:
         _check_layout(path, name, header)
         # A member keeps the file of its archive open until it is closed itself.
         return ArraySequence(path, archive.open(f"{name}.npy"), header, fps=fps, metres=metres, up=up)
-    except (zipfile.BadZipFile, EOFError, zlib.error, OSError) as error:
+    except _ARCHIVE_DAMAGE as error:
         raise _damaged(path, error) from error
     finally:
         archive.close()
@@ -152,7 +127,7 @@ def _named(fields: NpzFields, key: str, known: dict) -> float | UpAxis:
     return found
 
 
-def _vertex_member(path: Path, archive: zipfile.ZipFile) -> tuple[str, _Header]:
+def _vertex_member(path: Path, archive: zipfile.ZipFile) -> tuple[str, ArrayHeader]:
     """Name and layout of the array that holds the vertices."""
     found = {}
     for name in archive.namelist():
@@ -160,7 +135,7 @@ def _vertex_member(path: Path, archive: zipfile.ZipFile) -> tuple[str, _Header]:
             continue
         try:
             with archive.open(name) as stream:
-                header = _read_header(stream)
+                header = read_array_header(stream)
         except ValueError as error:
             if name == f"{_KEY}.npy":
                 raise _damaged(path, error) from error
@@ -168,7 +143,7 @@ def _vertex_member(path: Path, archive: zipfile.ZipFile) -> tuple[str, _Header]:
         found[name.removesuffix(".npy")] = header
     if _KEY in found:
         return _KEY, found[_KEY]
-    fitting = [name for name, header in found.items() if header.holds_vertices]
+    fitting = [name for name, header in found.items() if _holds_vertices(header)]
     if len(fitting) != 1:
         shapes = ", ".join(f"{name} {header.shape}" for name, header in found.items())
         raise InputError(
@@ -180,8 +155,19 @@ def _vertex_member(path: Path, archive: zipfile.ZipFile) -> tuple[str, _Header]:
     return fitting[0], found[fitting[0]]
 
 
-def _check_layout(path: Path, name: str, header: _Header) -> None:
-    if not header.holds_vertices or header.fortran or 0 in header.shape:
+def _holds_vertices(header: ArrayHeader) -> bool:
+    """Whether the array is numbers of shape (frames, vertices, 3)."""
+    return len(header.shape) == 3 and header.shape[2] == 3 and header.dtype.kind in "fiu"
+
+
+def _check_layout(path: Path, name: str, header: ArrayHeader) -> None:
+    if _holds_vertices(header) and header.shape[1] > _MOST_VERTICES:
+        raise AssetError(
+            path,
+            cause=f"{name} has {header.shape[1]} vertices a frame, more than any body",
+            fix="Save the body alone.",
+        )
+    if not _holds_vertices(header) or header.fortran or 0 in header.shape:
         order = " in Fortran order" if header.fortran else ""
         raise InputError(
             f"{path}: {name}",

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Literal
 
 from soma_core.errors import InputError
-from soma_core.io.npz_fields import refuse_missing
+from soma_core.files import refuse_unreadable
 from soma_core.io.vertex_arrays import open_npy, open_npz_vertices
 from soma_core.io.vertex_folder import FolderSequence
 from soma_core.io.vertex_glb import GlbSequence
@@ -63,7 +63,7 @@ def open_vertex_sequence(
 def _open(path: Path) -> VertexSequence:
     if path.is_dir():
         return FolderSequence(path)
-    refuse_missing(path)
+    refuse_unreadable(path)
     reader = _READERS.get(path.suffix.lower())
     if reader is None:
         raise InputError(

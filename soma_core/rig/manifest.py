@@ -10,6 +10,7 @@ from typing import Any
 
 from soma_core.cache import atomic_write, file_sha256
 from soma_core.errors import AssetError
+from soma_core.files import refuse_unreadable
 
 __all__ = [
     "MANIFEST_NAME",
@@ -18,7 +19,6 @@ __all__ = [
     "Manifest",
     "check_files",
     "read_manifest",
-    "refuse_unreadable",
     "verified_sha256",
     "write_manifest",
 ]
@@ -45,23 +45,6 @@ class Manifest:
     files: Mapping[str, Mapping[str, Any]]
 
 
-def refuse_unreadable(path: Path) -> None:
-    """Refuse a file that is absent, empty or a git-LFS pointer.
-
-    Raises:
-        AssetError: in these three cases.
-    """
-    if not path.is_file():
-        raise AssetError(path, cause="file is missing", fix=_RESTORE)
-    with open(path, "rb") as stream:
-        head = stream.read(64)
-    if not head:
-        raise AssetError(path, cause="file is empty", fix=_RESTORE)
-    if head.startswith(b"version https://git-lfs"):
-        cause = "file is a git-LFS pointer, not the data"
-        raise AssetError(path, cause=cause, fix="Fetch it with `git lfs pull`")
-
-
 def read_manifest(root: Path) -> Manifest:
     """Read ``MANIFEST.json`` of an assets folder.
 
@@ -69,7 +52,7 @@ def read_manifest(root: Path) -> Manifest:
         AssetError: missing, not JSON, of another schema, or without a required key.
     """
     path = root / MANIFEST_NAME
-    refuse_unreadable(path)
+    refuse_unreadable(path, fix=_RESTORE)
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
     except ValueError as error:
@@ -106,7 +89,7 @@ def verified_sha256(root: Path, manifest: Manifest, name: str) -> str:
     path = root / name
     if name not in manifest.files:
         raise AssetError(root / MANIFEST_NAME, cause=f"does not list {name}", fix=_RESTORE)
-    refuse_unreadable(path)
+    refuse_unreadable(path, fix=_RESTORE)
     expected = manifest.files[name]
     size = path.stat().st_size
     if size != expected["size"]:

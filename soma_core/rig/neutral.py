@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import zipfile
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -13,8 +12,9 @@ import numpy as np
 
 from soma_core.cache import atomic_write
 from soma_core.errors import AssetError, InputError
+from soma_core.npz import open_npz_file
 from soma_core.paths import assets_dir
-from soma_core.rig.manifest import NEUTRAL_NAME, read_manifest, refuse_unreadable, verified_sha256
+from soma_core.rig.manifest import NEUTRAL_NAME, read_manifest, verified_sha256
 
 __all__ = [
     "SEGMENT_NAMES",
@@ -115,18 +115,19 @@ def read_arrays(path: Path, names: Iterable[str]) -> dict[str, np.ndarray]:
     Raises:
         AssetError: unreadable file or missing keys.
     """
-    refuse_unreadable(path)
     fix = "Restore the file, or make it again with `soma assets build`"
-    try:
-        # np.load opened by name leaks its handle when the archive is broken.
-        with open(path, "rb") as stream, np.load(stream, allow_pickle=False) as file:
-            missing = [name for name in names if name not in file.files]
-            if not missing:
-                wanted = [*names, *(["metadata"] if "metadata" in file.files else [])]
-                return {name: file[name] for name in wanted}
-    except (OSError, TypeError, ValueError, EOFError, zipfile.BadZipFile) as error:
-        raise AssetError(path, cause=f"not a readable npz ({error})", fix=fix) from error
-    raise AssetError(path, cause=f"missing keys {missing}", fix=fix)
+    with open_npz_file(path, fix=fix) as file:
+        missing = [name for name in names if name not in file.names]
+        if missing:
+            raise AssetError(path, cause=f"missing keys {missing}", fix=fix)
+        wanted = [*names, *(["metadata"] if "metadata" in file.names else [])]
+        found = {}
+        for name in wanted:
+            try:
+                found[name] = file.read(name)
+            except ValueError as error:
+                raise AssetError(path, cause=f"{name} cannot be read ({error})", fix=fix) from error
+    return found
 
 
 def _read_metadata(path: Path, arrays: Mapping[str, np.ndarray]) -> dict[str, Any]:

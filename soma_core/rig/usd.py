@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from soma_core.errors import AssetError
+from soma_core.files import refuse_unreadable
 from soma_core.rig.influences import read_weights
-from soma_core.rig.manifest import refuse_unreadable
 from soma_core.rig.mesh import Lod
 from soma_core.rig.skeleton import Rig
 from soma_core.rig.stored import StoredRig
@@ -63,7 +63,7 @@ class _Skeleton:
 def _open(path: Path) -> Usd.Stage:
     from pxr import Tf, Usd
 
-    refuse_unreadable(path)
+    refuse_unreadable(path, fix="Restore the file, or make it again with `soma assets build`")
     try:
         return Usd.Stage.Open(str(path))
     except Tf.ErrorException as error:

@@ -9,11 +9,12 @@ import scipy.sparse
 
 from soma_core.cache import cached_arrays, content_key, file_sha256
 from soma_core.errors import InputError
+from soma_core.files import refuse_unreadable
 from soma_core.geometry.barycentric import closest_point_on_triangle, tetrahedral_coordinates
 from soma_core.plugin.spec import WrapPair
 from soma_core.rig.mesh import CanonicalMesh
 from soma_core.topology.closest import ClosestFaces
-from soma_core.topology.wrap_pair import check_wrap, read_obj, refuse_unreadable
+from soma_core.topology.wrap_pair import check_wrap, read_obj
 
 __all__ = ["Correspondence", "affine_matrix", "build_correspondence", "load_correspondence"]
 
@@ -147,7 +148,7 @@ def load_correspondence(pair: WrapPair, mesh: CanonicalMesh) -> Correspondence:
         InputError: the wrap is not the canonical mesh, or the two files lie apart.
     """
     for path in (pair.native, pair.wrap):
-        refuse_unreadable(path)
+        refuse_unreadable(path, fix="Reinstall the backend or name another file.")
     key = content_key(
         "correspondence", _CODE_VERSION, file_sha256(pair.native), file_sha256(pair.wrap), mesh.revision
     )

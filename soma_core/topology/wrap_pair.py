@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from soma_core.errors import AssetError, InputError
+from soma_core.files import refuse_unreadable
 from soma_core.rig.mesh import CanonicalMesh
 
 __all__ = [
@@ -16,27 +17,10 @@ __all__ = [
     "check_order",
     "check_wrap",
     "read_obj",
-    "refuse_unreadable",
 ]
 
-_LFS = b"version https://git-lfs"
-
-
-def refuse_unreadable(path: Path | str) -> None:
-    """Raise AssetError where `path` is missing, closed to us, or a git-LFS pointer."""
-    try:
-        with open(path, "rb") as stream:
-            head = stream.read(len(_LFS))
-    except OSError as error:
-        raise AssetError(
-            path,
-            cause=f"cannot be read ({error.strerror})",
-            fix="Reinstall the backend or name another file.",
-        ) from error
-    if head == _LFS:
-        raise AssetError(
-            path, cause="is a git-LFS pointer, not the mesh", fix="Run `git lfs pull` where it lies."
-        )
+_MOST_BYTES = 256 * 2**20
+"""A hundred times the largest pair; an OBJ unfolds to some ten times its size in memory."""
 
 
 def read_obj(path: Path | str) -> tuple[np.ndarray, np.ndarray]:
@@ -48,7 +32,7 @@ def read_obj(path: Path | str) -> tuple[np.ndarray, np.ndarray]:
     Raises:
         AssetError: missing, a git-LFS pointer, not an OBJ mesh, or not finite.
     """
-    refuse_unreadable(path)
+    refuse_unreadable(path, fix="Reinstall the backend or name another file.", most_bytes=_MOST_BYTES)
     text = Path(path).read_text(encoding="utf-8", errors="replace").replace("\\\n", " ")
     points: list[list[float]] = []
     faces: list[tuple[int, int, int]] = []
@@ -88,6 +72,8 @@ def _fan(fields: list[str], count: int) -> list[tuple[int, int, int]]:
     if len(fields) < 3:
         raise ValueError(fields)
     numbers = [int(field.partition("/")[0]) for field in fields]
+    if max(map(abs, numbers)) >= 2**31:
+        raise ValueError(fields)
     ids = [number - 1 if number > 0 else number + count for number in numbers]
     return [(ids[0], ids[i], ids[i + 1]) for i in range(1, len(ids) - 1)]
 

@@ -171,7 +171,7 @@ def test_pickled_objects_are_never_loaded(motion, tmp_path):
     arrays = dict(np.load(path))
     save(path, **arrays, extra=np.array([{}], dtype=object))  # not needed, so not read
     read_motion(path)
-    with pytest.raises(InputError, match=r"transl: got an unreadable array .*allow_pickle"):
+    with pytest.raises(InputError, match=r"transl: got an unreadable array .*Python objects"):
         read_motion(save(path, **arrays | {"transl": np.array([{}], dtype=object)}))
 
 
@@ -189,7 +189,7 @@ def test_missing_keys_are_named(motion, tmp_path):
 
 def test_files_that_are_no_motion_are_told_apart(tmp_path):
     path = tmp_path / "m.npz"
-    with pytest.raises(AssetError, match=r"m\.npz: no such file"):
+    with pytest.raises(AssetError, match=r"m\.npz: file is missing"):
         read_motion(path)
     path.write_bytes(b"version https://git-lfs.github.com/spec/v1\noid sha256:1234\nsize 7\n")
     with pytest.raises(AssetError, match=r"git-LFS pointer.*git lfs pull"):
@@ -209,7 +209,7 @@ def test_a_damaged_file_is_refused(motion, tmp_path):
     where = content.index(b"poses.npy") + 200
     content[where : where + 50] = bytes(50)
     path.write_bytes(content)
-    with pytest.raises(AssetError, match=r"damaged NPZ file"):
+    with pytest.raises(InputError, match=r"poses: got an unreadable array .Bad CRC"):
         read_motion(path)
 
 

@@ -174,7 +174,7 @@ def test_a_cache_that_cannot_be_written_costs_only_time(tmp_path, pair, made, mo
 @pytest.mark.parametrize("name", ["native", "wrap"])
 def test_missing_files_are_named(own_cache, pair, tmp_path, name):
     broken = WrapPair(**{"native": pair.native, "wrap": pair.wrap, name: tmp_path / "gone.obj"})
-    with pytest.raises(AssetError, match=r"gone.obj: cannot be read \(No such file.*Reinstall"):
+    with pytest.raises(AssetError, match=r"gone.obj: file is missing.*Reinstall"):
         load_correspondence(broken, MESH)
 
 

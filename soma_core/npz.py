@@ -1,0 +1,142 @@
+"""Arrays of an NPZ file: nothing is unpickled, and nothing is read that the file is too small to hold."""
+
+from __future__ import annotations
+
+import lzma
+import math
+import struct
+import zipfile
+import zlib
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import IO
+
+import numpy as np
+
+from soma_core.errors import AssetError
+from soma_core.files import refuse_unreadable
+
+__all__ = ["ArrayHeader", "NpzFile", "open_npz_file", "read_array_header"]
+
+_DAMAGE = (
+    ValueError, TypeError, KeyError, IndexError, EOFError, OSError, RuntimeError, MemoryError, OverflowError,
+    SyntaxError, struct.error, zlib.error, lzma.LZMAError, zipfile.BadZipFile,
+)  # fmt: skip
+"""What zipfile and numpy raise for files that are not what they say. RuntimeError: encrypted members."""
+
+_BLOCK = 2**20
+_SMALL = 256 * 2**20
+_MOST_EXPANSION = 64
+"""Times its size that a large file may unfold to; zeros reach 1,000, motion and meshes 2 to 10."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ArrayHeader:
+    """Layout of one stored array: where its numbers begin and what they are."""
+
+    shape: tuple[int, ...]
+    dtype: np.dtype
+    fortran: bool
+    begin: int
+
+    @property
+    def byte_count(self) -> int:
+        """Bytes of its numbers."""
+        return math.prod(self.shape) * self.dtype.itemsize
+
+
+def read_array_header(stream: IO[bytes]) -> ArrayHeader:
+    """Read the header of an NPY stream.
+
+    Raises:
+        ValueError: it is none, or describes objects or a shape that cannot be.
+    """
+    try:
+        version = np.lib.format.read_magic(stream)
+        readers = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
+        if version not in readers:
+            raise ValueError(f"NPY version {version}")
+        shape, fortran, dtype = readers[version](stream)
+    except _DAMAGE as error:
+        raise ValueError(f"{error or type(error).__name__}"[:200]) from error
+    if dtype.hasobject:
+        raise ValueError("Python objects, which can run code")
+    if any(size < 0 for size in shape):
+        raise ValueError(f"the shape {shape}")
+    return ArrayHeader(shape=shape, dtype=dtype, fortran=fortran, begin=stream.tell())
+
+
+class NpzFile:
+    """The named arrays of one NPZ file, read on demand."""
+
+    def __init__(self, path: Path, archive: zipfile.ZipFile) -> None:
+        self.path = path
+        self._archive = archive
+        self._members = {info.filename.removesuffix(".npy"): info for info in archive.infolist()}
+        self._most = max(_SMALL, _MOST_EXPANSION * path.stat().st_size)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Keys in the order they were stored."""
+        return tuple(self._members)
+
+    def header(self, name: str) -> ArrayHeader:
+        """Layout of the array under `name`; its numbers stay unread.
+
+        Raises:
+            ValueError: damaged, or Python objects; the text says which.
+        """
+        with self._open(name) as stream:
+            return read_array_header(stream)
+
+    def read(self, name: str) -> np.ndarray:
+        """Array under `name`.
+
+        Raises:
+            ValueError: damaged, Python objects, or larger than the file can mean.
+        """
+        info = self._members[name]
+        with self._open(name) as stream:
+            header = read_array_header(stream)
+            if header.begin + header.byte_count != info.file_size:
+                stored = info.file_size - header.begin
+                raise ValueError(f"{stored} bytes for the shape {header.shape} of {header.dtype}")
+            if header.byte_count > self._most:
+                raise ValueError(
+                    f"{header.byte_count} bytes in a file of {self.path.stat().st_size}; "
+                    f"at most {self._most} are read"
+                )
+            data = bytearray()
+            while block := stream.read(_BLOCK):  # to the very end, where the checksum is compared
+                data += block
+        if len(data) != header.byte_count:
+            raise ValueError(f"{len(data)} bytes for the shape {header.shape} of {header.dtype}")
+        return np.ndarray(header.shape, header.dtype, data, order="F" if header.fortran else "C")
+
+    @contextmanager
+    def _open(self, name: str) -> Iterator[IO[bytes]]:
+        try:
+            with self._archive.open(self._members[name]) as stream:
+                yield stream
+        except _DAMAGE as error:
+            raise ValueError(str(error) or type(error).__name__) from error
+
+
+@contextmanager
+def open_npz_file(path: Path | str, *, fix: str = "Fetch or write it again.") -> Iterator[NpzFile]:
+    """Open an NPZ file.
+
+    Raises:
+        AssetError: missing, a git-LFS pointer, or no NPZ.
+    """
+    head = refuse_unreadable(path, fix=fix)
+    if not zipfile.is_zipfile(path):
+        raise AssetError(path, cause=f"not an NPZ file (it starts with {head[:8]!r})", fix=fix)
+    try:
+        archive = zipfile.ZipFile(path)
+    except _DAMAGE as error:
+        raise AssetError(path, cause=f"damaged NPZ file ({error})", fix=fix) from error
+    with archive:
+        yield NpzFile(Path(path), archive)
