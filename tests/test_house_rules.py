@@ -24,7 +24,7 @@ TREE_MIB = 24
 
 # A package imports from lower ranks and its own, never from higher ones.
 RANKS = [
-    {"errors", "paths", "cache", "files", "progress"},
+    {"errors", "paths", "cache", "files", "npz", "progress"},
     {"geometry", "plugin"},
     {"kernels", "_inputs"},
     {"rig", "topology", "skeleton", "animation", "correctives"},
