@@ -9,6 +9,7 @@ is touched, and none has to be assigned to one subtree.
 
 from __future__ import annotations
 
+import itertools
 import re
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
@@ -93,10 +94,15 @@ class Level(torch.nn.Module):
 def sweep_levels(
     structure: MomentStructure, chosen: np.ndarray, *, device: torch.device | str
 ) -> torch.nn.ModuleList:
-    """Levels from the root to the leaves, of those joints in `chosen` that a fit can determine."""
+    """Levels from the root to the leaves, of those joints in `chosen` that a fit can determine.
+
+    Each level must lie below the one before: a sweep follows the residual of what is below alone.
+    """
     kept = np.intersect1d(structure.variables, chosen)
     parts = [np.intersect1d(level, kept) for level in joint_levels(structure.parents)]
-    return torch.nn.ModuleList(Level(structure, part, device=device) for part in parts if len(part))
+    parts = [part for part in parts if len(part)]
+    assert all(structure.ancestors[a].any(0)[b].all() for a, b in itertools.pairwise(parts))
+    return torch.nn.ModuleList(Level(structure, part, device=device) for part in parts)
 
 
 class Analytical(torch.nn.Module):
