@@ -34,15 +34,16 @@ def chunk_arrays(
     report = InversionReport(layer.mesh, layer.rig)
     report.add(result)
     error = result.vertex_error.detach().cpu().float().numpy()
-    known = np.isfinite(error)
-    count = known.sum(axis=1)
-    mean = np.where(known, error, 0).sum(axis=1, dtype=np.float64) / np.maximum(count, 1)
+    skin = np.delete(error, layer.mesh.face_interior, axis=1)
+    known = np.isfinite(skin)
+    count, skin = known.sum(axis=1), np.where(known, skin, 0)
+    mean = skin.sum(axis=1, dtype=np.float64) / np.maximum(count, 1)
     outcome = {
         "valid": result.valid.cpu().numpy(),
         "converged": result.converged.cpu().numpy(),
         "iterations": result.iterations.cpu().numpy(),
         "mean_error": np.where(count, mean, np.nan).astype(np.float32),
-        "largest_error": np.where(count, np.where(known, error, 0).max(axis=1), np.nan).astype(np.float32),
+        "largest_error": np.where(count, skin.max(axis=1), np.nan).astype(np.float32),
     }
     worst = worst_frames(outcome["mean_error"], kept, apart=apart)
     return {
@@ -67,7 +68,10 @@ def worst_frames(errors: np.ndarray, count: int, *, apart: int) -> np.ndarray:
 
 
 def per_frame(chunks: FittedChunks) -> dict[str, np.ndarray]:
-    """Outcome of every frame: usable, converged, iterations, mean and largest error [m] (NaN: not usable)."""
+    """Outcome of every frame: usable, converged, iterations, mean and largest error of the skin [m].
+
+    Errors are NaN where a frame could not be used.
+    """
     rows = list(chunks.load_all(*_PER_FRAME))
     return {name: np.concatenate([row[index] for row in rows]) for index, name in enumerate(_PER_FRAME)}
 
@@ -114,20 +118,20 @@ def draw_worst(
         for worst, errors in chunks.load_all("worst", "worst_error")
         for frame, error in zip(worst, errors, strict=True)
     }
+    frames = per_frame(chunks)
     means = np.full(chunks.frame_count, np.nan)
-    for frame, error in kept.items():
-        means[frame] = np.nanmean(error)
+    means[list(kept)] = frames["mean_error"][list(kept)]
     bodies, shown = [], []
     for frame in worst_frames(means, count, apart=apart).tolist():
         number, place = divmod(frame, chunks.size)
         arrays = chunks.load(number, "rotations", "translation")
         pose = (torch.as_tensor(array[place : place + 1]).to(layer.device, layer.dtype) for array in arrays)
         vertices = layer.pose(identity, *pose).vertices[0].cpu().numpy()
-        error = _MM * kept[frame]
-        caption = f"frame {frame}\nmean {np.nanmean(error):.3g} mm, max {np.nanmax(error):.3g} mm"
+        mean, largest = (_MM * frames[name][frame] for name in ("mean_error", "largest_error"))
+        caption = f"frame {frame}\nmean {mean:.3g} mm, max {largest:.3g} mm"
         bodies.append(
             Body(vertices=vertices, triangles=layer.mesh.triangles, colour=(0.8, 0.8, 0.8), caption=caption)
         )
-        shown.append(error)
+        shown.append(_MM * kept[frame])
     if bodies:
         error_sheet(path, bodies, shown, width=width)
