@@ -44,7 +44,7 @@ def assembly_functions(scalar: str, lanes: int, *, shared: bool) -> SimpleNamesp
     types, tree = lane_types(scalar, lanes), tree_functions(scalar, lanes, shared=shared)
     pair_moment = _pair_moment(types, tree)
     column_moments = _column_moments(types, tree, pair_moment, _hand_up(tree))
-    moments = _moments(types, tree, column_moments)
+    moments = _moments(types, tree, column_moments, _push(tree))
     return SimpleNamespace(moments=moments, forces=_forces(types, tree), finish=_finish(tree))
 
 
@@ -138,7 +138,37 @@ def _column_moments(types, tree, pair_moment, hand_up):
     return column_moments
 
 
-def _moments(types, tree, column_moments):
+def _push(tree):
+    frames = tree.frames
+
+    @wp.func
+    def push(w: int, k: int, plan: Plan, places: frames, blocks: frames, root: frames):
+        """Add a finished column to that of the joint's parent, about the parent."""
+        above = plan.parent_column[k]
+        j = 3 * plan.joint[k]
+        p = 3 * plan.parent[k]
+        s0 = places[w, j] - places[w, p]
+        s1 = places[w, j + 1] - places[w, p + 1]
+        s2 = places[w, j + 2] - places[w, p + 2]
+        for e in range(plan.push_start[k], plan.push_start[k + 1]):
+            for r in range(3):
+                a = 12 * plan.push_source[e] + 4 * r
+                b = 12 * plan.push_target[e] + 4 * r
+                last = blocks[w, a + 3]
+                blocks[w, b] += blocks[w, a] + wp.cw_mul(last, s0)
+                blocks[w, b + 1] += blocks[w, a + 1] + wp.cw_mul(last, s1)
+                blocks[w, b + 2] += blocks[w, a + 2] + wp.cw_mul(last, s2)
+                blocks[w, b + 3] += last
+        m = root[w, 4 * k + 3]
+        root[w, 4 * above] += root[w, 4 * k] + wp.cw_mul(m, s0)
+        root[w, 4 * above + 1] += root[w, 4 * k + 1] + wp.cw_mul(m, s1)
+        root[w, 4 * above + 2] += root[w, 4 * k + 2] + wp.cw_mul(m, s2)
+        root[w, 4 * above + 3] += m
+
+    return push
+
+
+def _moments(types, tree, column_moments, push):
     real, vec, frames, constants = types.real, types.vec, tree.frames, tree.constants
 
     @wp.func
@@ -153,27 +183,8 @@ def _moments(types, tree, column_moments):
             root[w, i] = vec(real(0.0))
         for k in range(plan.joint.shape[0]):
             column_moments(w, g, k, plan, second, turns, places, column, blocks, root)
-            above = plan.parent_column[k]
-            if above >= 0:
-                j = 3 * plan.joint[k]
-                p = 3 * plan.parent[k]
-                s0 = places[w, j] - places[w, p]
-                s1 = places[w, j + 1] - places[w, p + 1]
-                s2 = places[w, j + 2] - places[w, p + 2]
-                for e in range(plan.push_start[k], plan.push_start[k + 1]):
-                    a = 12 * plan.push_source[e]
-                    b = 12 * plan.push_target[e]
-                    for r in range(3):
-                        last = blocks[w, a + 4 * r + 3]
-                        blocks[w, b + 4 * r] += blocks[w, a + 4 * r] + wp.cw_mul(last, s0)
-                        blocks[w, b + 4 * r + 1] += blocks[w, a + 4 * r + 1] + wp.cw_mul(last, s1)
-                        blocks[w, b + 4 * r + 2] += blocks[w, a + 4 * r + 2] + wp.cw_mul(last, s2)
-                        blocks[w, b + 4 * r + 3] += last
-                m = root[w, 4 * k + 3]
-                root[w, 4 * above] += root[w, 4 * k] + wp.cw_mul(m, s0)
-                root[w, 4 * above + 1] += root[w, 4 * k + 1] + wp.cw_mul(m, s1)
-                root[w, 4 * above + 2] += root[w, 4 * k + 2] + wp.cw_mul(m, s2)
-                root[w, 4 * above + 3] += m
+            if plan.parent_column[k] >= 0:
+                push(w, k, plan, places, blocks, root)
 
     return moments
 

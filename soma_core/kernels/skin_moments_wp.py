@@ -42,6 +42,16 @@ def _joint_moments(types):
     real, vec, frames = types.real, types.vec, wp.array2d(dtype=types.vec)
 
     @wp.func
+    def write(
+        g: int, k: int, t: int, x: vec, y: vec, z: vec, sums: vec, step: vec, mean: wp.array2d(dtype=real),
+        out: frames,
+    ):  # fmt: skip
+        out[g, k] = x + mean[t, 0] * step
+        out[g, k + 1] = y + mean[t, 1] * step
+        out[g, k + 2] = z + mean[t, 2] * step
+        out[g, k + 3] = sums + mean[t, 3] * step
+
+    @wp.func
     def joint_moments(
         w: int, g: int, t: int, start: _ids, vertex: _ids, weight: wp.array(dtype=real),
         local: wp.array2d(dtype=real), mean: wp.array2d(dtype=real), points: frames, origin: frames,
@@ -86,22 +96,10 @@ def _joint_moments(types):
             z1 += b1 * z
             z2 += b2 * z
             z3 += z
-        c0 -= origin[g, 0]
-        c1 -= origin[g, 1]
-        c2 -= origin[g, 2]
         k = 12 * t
-        out[g, k] = x0 + mean[t, 0] * c0
-        out[g, k + 1] = x1 + mean[t, 1] * c0
-        out[g, k + 2] = x2 + mean[t, 2] * c0
-        out[g, k + 3] = x3 + mean[t, 3] * c0
-        out[g, k + 4] = y0 + mean[t, 0] * c1
-        out[g, k + 5] = y1 + mean[t, 1] * c1
-        out[g, k + 6] = y2 + mean[t, 2] * c1
-        out[g, k + 7] = y3 + mean[t, 3] * c1
-        out[g, k + 8] = z0 + mean[t, 0] * c2
-        out[g, k + 9] = z1 + mean[t, 1] * c2
-        out[g, k + 10] = z2 + mean[t, 2] * c2
-        out[g, k + 11] = z3 + mean[t, 3] * c2
+        write(g, k, t, x0, x1, x2, x3, c0 - origin[g, 0], mean, out)
+        write(g, k + 4, t, y0, y1, y2, y3, c1 - origin[g, 1], mean, out)
+        write(g, k + 8, t, z0, z1, z2, z3, c2 - origin[g, 2], mean, out)
 
     return joint_moments
 
