@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
-__all__ = ["assets_dir", "cache_dir", "configs_dir"]
+__all__ = ["assets_dir", "cache_dir", "configs_dir", "data_dir"]
 
 _PACKAGE = Path(__file__).resolve().parent
 
@@ -34,3 +34,15 @@ def cache_dir() -> Path:
         return Path(override).expanduser()
     base = os.environ.get("XDG_CACHE_HOME")
     return (Path(base) if base else Path.home() / ".cache") / "soma_core"
+
+
+def data_dir() -> Path:
+    """Folder of models that the user supplies: SOMA_DATA_DIR, else XDG_DATA_HOME/soma_core, else the like.
+
+    Nothing is put there but by a command that names it; the default is ~/.local/share/soma_core.
+    """
+    override = os.environ.get("SOMA_DATA_DIR")
+    if override:
+        return Path(override).expanduser()
+    base = os.environ.get("XDG_DATA_HOME")
+    return (Path(base) if base else Path.home() / ".local" / "share") / "soma_core"

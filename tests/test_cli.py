@@ -98,9 +98,9 @@ def test_the_worst_job_of_a_sweep_sets_the_exit_code(tmp_path: Path, monkeypatch
 
 def test_a_backend_that_is_not_usable_has_its_own_exit_code(tmp_path: Path, monkeypatch, capsys) -> None:
     monkeypatch.chdir(tmp_path)
-    assert main(["backends", "show", "smpl"]) == EXIT_BACKEND
-    assert main(["animate", "backend=smpl"]) == EXIT_BACKEND
-    assert capsys.readouterr().err.count("Run: pip install soma-backend-smpl") == 2
+    assert main(["backends", "show", "mhr"]) == EXIT_BACKEND
+    assert main(["animate", "backend=mhr"]) == EXIT_BACKEND
+    assert capsys.readouterr().err.count("Run: pip install soma-backend-mhr") == 2
 
 
 def test_strict_lets_the_traceback_through(monkeypatch) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import pluggy
@@ -21,6 +22,7 @@ __all__ = [
     "hookspec",
     "soma_backend",
     "soma_checks",
+    "soma_convert",
     "soma_generator",
 ]
 
@@ -46,3 +48,11 @@ def soma_generator(  # type: ignore[empty-body]
 @hookspec
 def soma_checks() -> Sequence[Check]:  # type: ignore[empty-body]
     """Give further conformance checks of this backend, besides those of the core. Optional."""
+
+
+@hookspec(firstresult=True)
+def soma_convert(source: Path, output: Path | None) -> Sequence[Path]:  # type: ignore[empty-body]
+    """Turn a file of the model's makers into what the backend reads, and return what was written. Optional.
+
+    `output` is the file to write; None leaves the choice to the plugin.
+    """

@@ -15,7 +15,14 @@ KNOWN_BACKENDS = {
 }
 """Backend name -> the distribution that provides it, or will: none is published on an index yet."""
 
-_IN_CHECKOUT = {"anny": "./plugins/anny", "toy": "./plugins/toy"}
+_IN_CHECKOUT = {
+    "anny": "./plugins/anny",
+    "garment": "./plugins/garment",
+    "smpl": "./plugins/smpl",
+    "smplh": "./plugins/smpl",
+    "smplx": "./plugins/smpl",
+    "toy": "./plugins/toy",
+}
 """Backend name -> its folder in this repository."""
 
 

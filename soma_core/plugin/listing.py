@@ -99,6 +99,7 @@ def declaration(registry: Registry, name: str) -> dict[str, Any]:
                 "found": item.path.exists(),
                 "description": item.description,
                 "url": item.url,
+                "command": item.command,
             }
             for item in spec.files
         ],
@@ -150,6 +151,7 @@ def declaration_text(document: Mapping[str, Any]) -> str:
     ]
     lines = _aligned([(key, value) for key, value in facts if value])
     lines += _table("files that you supply", [_file_row(item) for item in document["files"]])
+    lines += [f"  {line}" for line in _supplies(document["files"])]
     lines += _table("options (backend.options)", [_option_row(item) for item in document["options"]])
     groups = dict.fromkeys(item["group"] for item in document["params"])
     for group in groups:
@@ -193,7 +195,17 @@ def _table(heading: str, rows: Sequence[Sequence[str]]) -> list[str]:
 
 
 def _file_row(item: Mapping[str, Any]) -> tuple[str, ...]:
-    return ("found" if item["found"] else "missing", item["path"], item["description"], item["url"])
+    return ("found" if item["found"] else "missing", item["path"], item["description"])
+
+
+def _supplies(files: Iterable[Mapping[str, Any]]) -> list[str]:
+    """What to do about the first file that is missing: the others may come with it."""
+    missing = next((item for item in files if not item["found"]), None)
+    if missing is None:
+        return []
+    steps = [f"get it from {missing['url']}"] if missing["url"] else []
+    steps += [f"run: {missing['command']}"] if missing["command"] else [f"put it at {missing['path']}"]
+    return [f"next: {', then '.join(steps)}"]
 
 
 def _option_row(item: Mapping[str, Any]) -> tuple[str, ...]:

@@ -31,7 +31,7 @@ from soma_core.plugin.hooks import hook_manager
 from soma_core.plugin.installation import core_requirement, editable_folder, reinstall_command
 from soma_core.plugin.known import KNOWN_BACKENDS, install_line, publication
 from soma_core.plugin.options import checked_options
-from soma_core.plugin.spec import API_VERSION, OLDEST_API_VERSION, BackendSpec, Generator
+from soma_core.plugin.spec import API_VERSION, OLDEST_API_VERSION, BackendSpec, FileNeeded, Generator
 
 if TYPE_CHECKING:
     import pluggy
@@ -187,6 +187,20 @@ class Registry:
                 raise PluginError(problem)
         return found
 
+    def convert(self, name: str, source: Path, output: Path | None = None) -> tuple[Path, ...]:
+        """Let backend `name` turn a file of its model's makers into what it reads; return what it wrote.
+
+        Raises:
+            BackendError: the backend is not usable, converts nothing, or refuses the file.
+        """
+        self.spec(name)
+        record = self._records[name]
+        assert record.manager is not None
+        with _isolated(record, "files"):
+            if not record.manager.hook.soma_convert.get_hookimpls():
+                raise PluginError("it reads its model as it is", fix=f"See: soma backends show {name}")
+            return tuple(record.manager.hook.soma_convert(source=source, output=output))
+
     def isolated(self, name: str, stage: Stage) -> AbstractContextManager[None]:
         """Return a context that turns whatever is raised inside into an error of backend `name`.
 
@@ -280,15 +294,21 @@ class Registry:
         for needed in spec.files:
             with _isolated(record, "files"):
                 if not needed.path.exists():
-                    source = f" Get it from {needed.url}" if needed.url else ""
                     raise PluginError(
-                        f"{needed.description or 'a file'} is missing at {needed.path}",
-                        fix=f"Put the file there.{source}",
+                        f"{needed.description or 'a file'} is missing at {needed.path}", fix=_supply(needed)
                     )
         for path in (spec.wrap.native, spec.wrap.wrap) if spec.wrap else ():
             with _isolated(record, "wrap"):
                 if not path.is_file():
                     raise PluginError(f"the wrap pair names {path}, which does not exist")
+
+
+def _supply(needed: FileNeeded) -> str:
+    """How to come by a file that is missing."""
+    source = f"Get it from {needed.url}" if needed.url else ""
+    if needed.command:
+        return f"{source}, then run: {needed.command}" if source else f"Run: {needed.command}"
+    return f"Put the file there. {source}".strip()
 
 
 def _remedy(record: _Record, stage: Stage) -> str:
@@ -334,7 +354,8 @@ def _isolated(record: _Record, stage: Stage) -> Iterator[None]:
         if about_the_call or (os.environ.get("SOMA_STRICT") == "1" and not own_words):
             raise
         cause, fix = _cause_and_fix(error)
-        record.state = "broken"
+        if stage != "files":  # a plugin is not to blame for what its user has yet to supply
+            record.state = "broken"
         record.error = BrokenBackendError(
             who=record.who, stage=stage, cause=cause.rstrip(". "), fix=fix or _remedy(record, stage)
         )

@@ -72,11 +72,15 @@ class WrapPair:
 
 @dataclass(frozen=True, kw_only=True)
 class FileNeeded:
-    """A file that the user must supply, where it is looked for and where it comes from."""
+    """A file that the user must supply, where it is looked for and where it comes from.
+
+    `command` makes the file, from another that the user has; the error of a missing file shows it.
+    """
 
     path: Path
     description: str
     url: str = ""
+    command: str = ""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -52,11 +52,14 @@ def _parser() -> argparse.ArgumentParser:
             "--requirements", action="store_true", default=default, help="pinned versions, for a bug report"
         )
     show_one = verbs.add_parser("show", help="one backend: parameters, options, licence, files, wrap pair")
+    convert = verbs.add_parser("convert", help="turn a file of a model's makers into what its backend reads")
     check = verbs.add_parser("check", help="run the conformance checks of one backend")
     new = verbs.add_parser("new", help="write a distribution to start a backend of your own from")
-    for each, verb in ((show_one, _show), (check, _check), (new, _new)):
+    for each, verb in ((show_one, _show), (convert, _convert), (check, _check), (new, _new)):
         each.set_defaults(verb=verb)
         each.add_argument("name", metavar="NAME")
+    convert.add_argument("file", type=Path, metavar="FILE")
+    convert.add_argument("--output", type=Path, metavar="FILE", help="default: where the backend looks")
     check.add_argument("--level", choices=("core", "full"), default="full", help="default: %(default)s")
     check.add_argument(
         "-k", dest="only", metavar="ID", action="append", default=[], help="this check only; may be repeated"
@@ -99,7 +102,7 @@ def load_all(registry: Registry, *, canonical: tuple[CanonicalMesh, Rig] | None 
 def _show(options: argparse.Namespace) -> tuple[str, int]:
     document = show(default_registry(), options.name)
     text = json.dumps(document, indent=2) if options.json else listing.declaration_text(document)
-    return text, EXIT_OK
+    return text, EXIT_OK if all(item["found"] for item in document["files"]) else EXIT_BACKEND
 
 
 def show(registry: Registry, name: str) -> dict[str, Any]:
@@ -109,7 +112,7 @@ def show(registry: Registry, name: str) -> dict[str, Any]:
         BackendError: the backend is unknown, blocked, in conflict, or fails to declare.
     """
     document, spec = listing.declaration(registry, name), registry.spec(name)
-    if spec.wrap is None:
+    if spec.wrap is None or not all(item["found"] for item in document["files"]):
         return document
     from soma_core.rig import load_canonical
     from soma_core.topology.wrap_statistics import wrap_statistics
@@ -120,6 +123,11 @@ def show(registry: Registry, name: str) -> dict[str, Any]:
     except BackendError as error:
         document["wrap"]["error"] = listing.error_document(error)
     return document
+
+
+def _convert(options: argparse.Namespace) -> tuple[str, int]:
+    written = default_registry().convert(options.name, options.file, options.output)
+    return "\n".join(map(str, written)), EXIT_OK
 
 
 def _check(options: argparse.Namespace) -> tuple[str, int]:

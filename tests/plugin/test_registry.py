@@ -277,8 +277,8 @@ def test_unknown_but_known_of_names_the_distribution(name: str, line: str) -> No
 
 
 def test_a_package_that_is_not_published_is_not_promised() -> None:
-    with pytest.raises(UnknownBackendError, match=r"soma-backend-smpl is not published yet\)\. Run"):
-        Registry([good()]).spec("smplx")
+    with pytest.raises(UnknownBackendError, match=r"soma-backend-mhr is not published yet\)\. Run"):
+        Registry([good()]).spec("mhr")
     with pytest.raises(UnknownBackendError, match=r"from a checkout: pip install \./plugins/anny\)\. Run"):
         Registry([good()]).spec("anny")
 
@@ -339,6 +339,34 @@ def test_missing_user_file_says_where_and_from_where(tmp_path) -> None:
         registry.generator("good", **BUILD)
     needed.path.touch()
     assert callable(registry.generator("good", **BUILD).rest)
+
+
+def test_a_missing_user_file_is_no_defect_of_the_plugin(tmp_path) -> None:
+    command = "soma backends convert good FILE"
+    needed = FileNeeded(path=tmp_path / "model.npz", description="the model", command=command)
+    registry = Registry([FakeEntryPoint("good", declares(files=(needed,)))])
+    with pytest.raises(BrokenBackendError, match=f"the model is missing at .*Run: {command}$"):
+        registry.generator("good", **BUILD)
+    assert state(registry, "good") == "declared"
+    assert "is missing at" in str(registry.entries()[0].error)
+
+
+def test_converting_is_the_plugins(tmp_path) -> None:
+    def convert(source, output):
+        if source.suffix != ".raw":
+            raise AssetError(source, cause="is no model", fix="Give one.")
+        return [output or source.with_suffix(".npz")]
+
+    plugin = hooks(soma_backend=lambda: SOUND, soma_generator=lambda: FakeGenerator(), soma_convert=convert)
+    registry = Registry([FakeEntryPoint("good", plugin), good("other")])
+    assert registry.convert("good", tmp_path / "a.raw") == (tmp_path / "a.npz",)
+    assert registry.convert("good", tmp_path / "a.raw", tmp_path / "b.npz") == (tmp_path / "b.npz",)
+    with pytest.raises(BrokenBackendError, match=r'"good".*files: .*a\.txt: is no model\. Give one'):
+        registry.convert("good", tmp_path / "a.txt")
+    with pytest.raises(
+        BrokenBackendError, match=r"files: it reads its model as it is\. See: soma backends show"
+    ):
+        registry.convert("other", tmp_path / "a.raw")
 
 
 def test_missing_wrap_file_is_named(tmp_path) -> None:

@@ -84,7 +84,7 @@ def files_named(context: Context) -> None:
         parts = {
             "an absolute path": needed.path.is_absolute(),
             "a description": bool(needed.description.strip()),
-            "a url": bool(needed.url.strip()),
+            "a url or a command": bool(needed.url.strip() or needed.command.strip()),
         }
         missing = [part for part, there in parts.items() if not there]
         if missing:
@@ -92,7 +92,7 @@ def files_named(context: Context) -> None:
                 f"FileNeeded {needed.path}",
                 got=f"no {', no '.join(part.partition(' ')[2] for part in missing)}",
                 expected=", ".join(parts),
-                fix="Add it: the message about a missing file tells the user where to get it and put it.",
+                fix="Add it: the message about a missing file tells the user how to come by it.",
             )
 
 

@@ -1,0 +1,37 @@
+"""The backend smplh: SMPL-H."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from soma_backend_smpl._backend import build, convert, declare
+from soma_backend_smpl.family import SMPLH
+from soma_core.plugin.hookspecs import hookimpl
+from soma_core.plugin.spec import BackendSpec, Generator
+
+if TYPE_CHECKING:
+    import torch
+
+__all__ = ["soma_backend", "soma_convert", "soma_generator"]
+
+
+@hookimpl
+def soma_backend() -> BackendSpec:
+    """Declare SMPL-H."""
+    return declare(SMPLH)
+
+
+@hookimpl
+def soma_generator(
+    spec: BackendSpec, device: torch.device, dtype: torch.dtype, options: Mapping[str, Any]
+) -> Generator:
+    """Build SMPL-H from the user's file."""
+    return build(SMPLH, spec, device, dtype, options)
+
+
+@hookimpl
+def soma_convert(source: Path, output: Path | None) -> Sequence[Path]:
+    """Write a clean file of an official one."""
+    return convert(SMPLH, source, output)
