@@ -19,7 +19,7 @@ def _kernel(scalar: str, lanes: int):
     types = lane_types(scalar, lanes)
     real, width, frames = types.real, lanes, wp.array2d(dtype=types.vec)
     module = wp.get_module(f"soma_target_moments_{scalar}_{lanes}")
-    gather, joint_moments = _gather(types), _joint_moments(types)
+    gather, joint_moments = _gather(types), _joint_moments(types, _write(types))
 
     @wp.kernel(module=module, enable_backward=False)
     def moments(
@@ -38,7 +38,7 @@ def _kernel(scalar: str, lanes: int):
     return moments
 
 
-def _joint_moments(types):
+def _write(types):
     real, vec, frames = types.real, types.vec, wp.array2d(dtype=types.vec)
 
     @wp.func
@@ -50,6 +50,12 @@ def _joint_moments(types):
         out[g, k + 1] = y + mean[t, 1] * step
         out[g, k + 2] = z + mean[t, 2] * step
         out[g, k + 3] = sums + mean[t, 3] * step
+
+    return write
+
+
+def _joint_moments(types, write):
+    real, vec, frames = types.real, types.vec, wp.array2d(dtype=types.vec)
 
     @wp.func
     def joint_moments(
