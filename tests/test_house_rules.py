@@ -71,6 +71,7 @@ PUBLIC_NAMES = [
 HOOKS = {
     "soma_backend": [],
     "soma_checks": [],
+    "soma_convert": ["source", "output"],
     "soma_generator": ["spec", "device", "dtype", "options"],
 }
 
