@@ -92,7 +92,7 @@ class PoseInversion(torch.nn.Module):
         layer: SomaLayer,
         *,
         stages: Sequence[Stage] = ("procrustes", "gauss_newton"),
-        iterations: int = 12,
+        iterations: int = 40,
         tolerance: float = 2e-5,
         analytical: AnalyticalOptions | None = None,
         autograd: AutogradOptions | None = None,

@@ -51,7 +51,7 @@ class LadderOptions:
     """
 
     stages: Sequence[Stage] = ("procrustes", "gauss_newton")
-    iterations: int = 12
+    iterations: int = 40
     tolerance: float = 2e-5
     analytical: AnalyticalOptions = field(default_factory=AnalyticalOptions)
     autograd: AutogradOptions = field(default_factory=AutogradOptions)
@@ -68,7 +68,7 @@ class LadderOptions:
             raise InputError("stages", got="none", expected="at least one", fix="Use 'procrustes'.")
         if self.iterations < 0:
             raise InputError(
-                "iterations", got=self.iterations, expected="at least 0", fix="Pass iterations=12."
+                "iterations", got=self.iterations, expected="at least 0", fix="Pass iterations=40."
             )
         if not self.tolerance >= 0:
             raise InputError(
