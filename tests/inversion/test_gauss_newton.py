@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 
 from soma_core.geometry.rotations import axis_angle_to_matrix, orthonormality_error
+from soma_core.inversion.gauss_newton import GaussNewton
 from soma_core.inversion.moments import RestMoments
 from soma_core.inversion.problem import Pose
 from soma_core.skeleton.identity import Identity
@@ -311,3 +312,24 @@ def test_two_threads_find_what_one_finds(dtype, warp, two_threads):
         found.append(given.reached(given.solve(given.bind, warp=warp, iterations=2)))
     # Far from the minimum a step carries rounding on; a wrong factor would be off by decimetres.
     torch.testing.assert_close(found[1], found[0], atol=0.0 if warp else SEPARATE_M[dtype], rtol=0)
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
+def test_steps_are_recorded_as_a_cuda_graph_and_replayed_on_other_targets():
+    body, device = real(), torch.device("cuda")
+    given, other = case(dtype=torch.float32), case(dtype=torch.float32, spread=0.2)
+    solver = GaussNewton(body.structure, dtype=torch.float32, device=device)
+    rest = RestMoments(**{name: value.to(device) for name, value in vars(given.rest).items()})
+    start = Pose(**{name: value.to(device) for name, value in vars(given.bind).items()})
+    target = given.target.to(device)
+    side = torch.cuda.Stream()
+    with torch.cuda.stream(side):
+        solver(target, rest, start, iterations=3)  # libraries set themselves up
+    torch.cuda.current_stream().wait_stream(side)
+    graph = torch.cuda.CUDAGraph()
+    with torch.cuda.graph(graph):
+        found = solver(target, rest, start, iterations=3)
+    target.copy_(other.target.to(device))
+    graph.replay()
+    expected = solver(target, rest, start, iterations=3)
+    torch.testing.assert_close(found.relative, expected.relative)
