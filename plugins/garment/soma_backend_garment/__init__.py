@@ -1,0 +1,86 @@
+"""GarmentMeasurements for SOMA Core: bodies of a shape space of scans, read from the user's own file.
+
+The model (https://github.com/mbotsch/GarmentMeasurements) is under the GPL-3.0. Nothing of it is part of this
+package; ``soma backends convert garment point.pca`` makes what is read.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from soma_core.errors import InputError
+from soma_core.paths import data_dir
+from soma_core.plugin.hookspecs import hookimpl
+from soma_core.plugin.spec import BackendSpec, FileNeeded, Generator, Parameter, WrapPair
+
+if TYPE_CHECKING:
+    import torch
+
+__all__ = ["soma_backend", "soma_convert", "soma_generator"]
+
+_URL = "https://github.com/mbotsch/GarmentMeasurements"
+_CONVERT = "soma backends convert garment point.pca"
+
+
+def _folder() -> Path:
+    return data_dir() / "GarmentMeasurements"
+
+
+def _model() -> Path:
+    return _folder() / "point.npz"
+
+
+@hookimpl
+def soma_backend() -> BackendSpec:
+    """Declare the model and the files that only the user can supply."""
+    native, wrap = _folder() / "mean.obj", _folder() / "SOMA_wrap.obj"
+    return BackendSpec(
+        name="garment",
+        unit="m",
+        up="+y",
+        forward="+z",
+        params=(
+            Parameter(
+                name="coefficients",
+                shape=(15,),
+                description="of the principal components, in standard deviations; the first move a body most",
+            ),
+        ),
+        wrap=WrapPair(native=native, wrap=wrap),
+        fill_segments=("mouth_bag", "eye_bags"),
+        files=(
+            FileNeeded(path=_model(), description="the converted shape space", url=_URL, command=_CONVERT),
+            FileNeeded(path=native, description="its mean body, data/mean.obj of the repository", url=_URL),
+            FileNeeded(
+                path=wrap,
+                description="the canonical mesh laid on it",
+                command=f"soma wrap native={native} out={wrap.parent}",
+            ),
+        ),
+        licence="GPL-3.0",
+        url=_URL,
+        description="GarmentMeasurements, from the user's own file",
+    )
+
+
+@hookimpl
+def soma_generator(device: torch.device, dtype: torch.dtype) -> Generator:
+    """Build the generator from the converted file."""
+    from soma_backend_garment._generator import GarmentGenerator
+    from soma_backend_garment._point_pca import read_npz
+
+    return GarmentGenerator(read_npz(_model()), device, dtype)
+
+
+@hookimpl
+def soma_convert(source: Path, output: Path | None) -> Sequence[Path]:
+    """Write ``point.npz`` of ``point.pca``, by default where the backend looks for it."""
+    from soma_backend_garment._point_pca import read_pca, write_npz
+
+    target = output or _model()
+    if target.suffix.lower() != ".npz":
+        raise InputError("--output", got=str(target), expected="an .npz", fix="Leave it out.")
+    write_npz(target, read_pca(source), source=source)
+    return [target]
