@@ -8,7 +8,7 @@ from torch import Tensor
 from soma_core.errors import InputError
 from soma_core.geometry.rotations import axis_angle_to_matrix, orthonormality_error
 
-__all__ = ["check_bone_scale", "check_kind", "check_rotations", "check_translation"]
+__all__ = ["check_bone_scale", "check_kind", "check_rest", "check_rotations", "check_translation"]
 
 _ROTATION_TOLERANCE = 1e-2
 """Largest accepted entry of |R^T R - I|: above it a matrix is a mistake, not rounding."""
@@ -141,3 +141,16 @@ def check_bone_scale(
             fix="Use 1 for a bone that keeps its length.",
         )
     return bone_scale
+
+
+def check_rest(rest: Tensor, vertex_count: int, dtype: torch.dtype, device: torch.device) -> None:
+    """Refuse what are no vertices (batch, v, 3) of the canonical mesh."""
+    check_kind("rest", rest, dtype, device)
+    if rest.ndim != 3 or tuple(rest.shape[1:]) != (vertex_count, 3):
+        raise InputError(
+            "rest",
+            got=tuple(rest.shape),
+            expected=f"(batch, {vertex_count}, 3), the canonical mesh at the layer's LOD",
+            fix="Bring other topologies to it first: transfer or register them.",
+        )
+    _check_finite("rest", rest)

@@ -9,7 +9,7 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
-from soma_core._inputs import check_bone_scale, check_kind, check_rotations, check_translation
+from soma_core._inputs import check_bone_scale, check_kind, check_rest, check_rotations, check_translation
 from soma_core.animation.engine import Animation
 from soma_core.animation.posed import Posed
 from soma_core.backends.parameters import batch_parameters
@@ -127,6 +127,18 @@ class SomaLayer(torch.nn.Module):
         """
         batch = batch_parameters(self.spec, params, device=self.device, dtype=self.dtype)
         return self._identity(batch, *self.rest_shape(batch))
+
+    def identity_from_rest(self, rest: Tensor) -> Identity:
+        """Prepare identities of bodies that no parameters describe, such as scans on the canonical mesh.
+
+        Args:
+            rest: (batch, v, 3) [m], +Y up, near the bind pose; the skeleton is fitted to it.
+
+        Raises:
+            InputError: a wrong shape, dtype or device, or a NaN.
+        """
+        check_rest(rest, self.mesh.vertex_count, self.dtype, self.device)
+        return self._identity({}, rest.permute(2, 1, 0).contiguous(), self.rest_shape.fit(rest))
 
     def _identity(self, params: Mapping[str, Tensor], points: Tensor, fitted: Tensor) -> Identity:
         rest, bind = self.animation.repose(points, fitted) if self.repose else (points, fitted)

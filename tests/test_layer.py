@@ -883,6 +883,26 @@ def test_wrong_parameters(tiny):
         tiny().identity({"shape": [[0.0], [1.0]], "size": [1.0, 1.0, 1.0]})
 
 
+def test_an_identity_from_a_rest_shape_is_the_backends_own(tiny):
+    layer = tiny()
+    of_backend = layer.identity(params(2))
+    of_vertices = layer.identity_from_rest(of_backend.fitted_rest)
+    for name in ("rest", "bind_world", "fitted_rest", "fitted_world"):
+        found, expected = getattr(of_vertices, name), getattr(of_backend, name)
+        torch.testing.assert_close(found, expected, atol=SAME[torch.float64], rtol=0)
+    assert not of_vertices.params
+
+
+def test_wrong_rest_shapes(tiny):
+    layer, count = tiny(), tiny().mesh.vertex_count
+    with pytest.raises(InputError, match=rf"rest: got \(2, 5, 3\), expected \(batch, {count}, 3\)"):
+        layer.identity_from_rest(torch.zeros(2, 5, 3, dtype=torch.float64))
+    with pytest.raises(InputError, match="rest: got torch.float32, expected torch.float64"):
+        layer.identity_from_rest(torch.zeros(1, count, 3))
+    with pytest.raises(InputError, match=r"rest: got nan at index \(0, 0, 0\)"):
+        layer.identity_from_rest(torch.full((1, count, 3), torch.nan, dtype=torch.float64))
+
+
 def test_identities_of_another_layer_are_refused(tiny):
     """Of another rig, LOD, dtype or batch layout: the error says so, not a kernel far below."""
     turns = torch.zeros(1, 77, 3)

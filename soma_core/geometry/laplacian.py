@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import scipy.sparse
 
-__all__ = ["cotangent_laplacian"]
+__all__ = ["cotangent_laplacian", "vertex_areas"]
 
 _CLAMP = 1e-6
 """Smallest edge weight relative to the mean: keeps the interior block positive definite."""
@@ -37,3 +37,10 @@ def cotangent_laplacian(vertices: np.ndarray, triangles: np.ndarray) -> scipy.sp
     weights.data = np.maximum(weights.data, _CLAMP * np.abs(weights.data).mean())
     degree = np.asarray(weights.sum(1)).ravel()
     return (scipy.sparse.diags_array(degree) - weights).tocsr()
+
+
+def vertex_areas(vertices: np.ndarray, triangles: np.ndarray) -> np.ndarray:
+    """A third of the area of the triangles around each vertex, (v,)."""
+    a, b, c = (vertices[triangles[:, corner]] for corner in range(3))
+    area = np.linalg.norm(np.cross(b - a, c - a), axis=1) / 6
+    return np.bincount(triangles.ravel(), np.repeat(area, 3), len(vertices))

@@ -158,7 +158,7 @@ class PoseInversion(torch.nn.Module):
             InputError: a wrong shape, a negative weight or bone scale, or vertices in another unit than they
                 should be; a gradient asked for with `robust` or a temporal prior.
         """
-        canonical = self._canonical(vertices, topology)
+        canonical = self.canonical(vertices, topology)
         with torch.no_grad():
             frames = self._frames(canonical.detach(), identity, weights, bone_scale, initial)
             result = self._fit_all(frames)
@@ -228,7 +228,8 @@ class PoseInversion(torch.nn.Module):
             refuse_unit_error(torch.cat([scale for _, scale in fits]))
         return joined([result for result, _ in fits])
 
-    def _canonical(self, vertices: Tensor, topology: Topology) -> Tensor:
+    def canonical(self, vertices: Tensor, topology: Topology) -> Tensor:
+        """Vertices (F, v, 3) [m] on the layer's mesh from what :meth:`forward` takes."""
         layer = self.layer
         if topology == "native":
             vertices = check_vertices(vertices, -1, fix="Pass the backend's own vertices.")

@@ -234,7 +234,6 @@ class GaussNewton(torch.nn.Module):
     ) -> tuple[Tensor, Tensor]:
         """``J^T J`` (F, n + 1, 3, n + 1, 3) and ``J^T r`` (F, n + 1, 3), the translation last."""
         moments = self._subtree_moments(turns, places, second)
-        torque, force = self._subtree_forces(turns, places, residual)
         n = self.variables
         block = moments[:, n][:, :, n]
         spread = block[..., :3, :3]
@@ -247,7 +246,12 @@ class GaussNewton(torch.nn.Module):
         matrix[:, :count, :, count] = lever
         matrix[:, count, :, :count] = lever.permute(0, 3, 1, 2)
         matrix[:, count, :, count] = moments[:, 0, 0, 3, 3][:, None, None] * self.eye
-        return matrix, torch.cat((torque[:, n], force[:, :1]), 1)
+        return matrix, self.slopes(turns, places, residual)
+
+    def slopes(self, turns: Tensor, places: Tensor, residual: Tensor) -> Tensor:
+        """``J^T r`` (F, n + 1, 3) of the moments (F, T, 3, 4) of residuals, the translation last."""
+        torque, force = self._subtree_forces(turns, places, residual)
+        return torch.cat((torque[:, self.variables], force[:, :1]), 1)
 
     def _subtree_moments(self, turns: Tensor, places: Tensor, second: Tensor) -> Tensor:
         """``H_ij`` (F, J, J, 4, 4): second moments of subtree i against subtree j about their joints."""

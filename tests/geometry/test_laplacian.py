@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from soma_core.geometry.laplacian import cotangent_laplacian
+from soma_core.geometry.laplacian import cotangent_laplacian, vertex_areas
 from tests.bodies import cube_sphere, tiny_canonical
 
 ROUNDING = 1e-11
@@ -86,3 +86,12 @@ def test_obtuse_pairs_are_clamped():
     laplacian = cotangent_laplacian(points, np.array([[0, 1, 2], [1, 0, 3]])).toarray()
     assert laplacian[0, 1] < 0  # the plain cotangent sum is about -5
     assert np.linalg.eigvalsh(laplacian)[0] > -ROUNDING
+
+
+def test_areas_of_vertices():
+    points, triangles = flat_grid()
+    areas = vertex_areas(points, triangles)
+    np.testing.assert_allclose(areas.sum(), 1.0, atol=ROUNDING)
+    inside = (points[:, :2] > 0).all(1) & (points[:, :2] < 1).all(1)
+    np.testing.assert_allclose(areas[inside], 1 / 36, atol=ROUNDING)  # six half cells, a third of each
+    np.testing.assert_allclose(areas.min(), 1 / 36 / 6, atol=ROUNDING)  # a corner with one triangle
