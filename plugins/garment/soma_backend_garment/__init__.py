@@ -6,10 +6,12 @@ package; ``soma backends convert garment point.pca`` makes what is read.
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from soma_core.cache import atomic_write
 from soma_core.errors import InputError
 from soma_core.paths import data_dir
 from soma_core.plugin.hookspecs import hookimpl
@@ -52,7 +54,7 @@ def soma_backend() -> BackendSpec:
         fill_segments=("mouth_bag", "eye_bags"),
         files=(
             FileNeeded(path=_model(), description="the converted shape space", url=_URL, command=_CONVERT),
-            FileNeeded(path=native, description="its mean body, data/mean.obj of the repository", url=_URL),
+            FileNeeded(path=native, description="its mean body, mean.obj beside point.pca", url=_URL),
             FileNeeded(
                 path=wrap,
                 description="the canonical mesh laid on it",
@@ -76,11 +78,15 @@ def soma_generator(device: torch.device, dtype: torch.dtype) -> Generator:
 
 @hookimpl
 def soma_convert(source: Path, output: Path | None) -> Sequence[Path]:
-    """Write ``point.npz`` of ``point.pca``, by default where the backend looks for it."""
+    """Write ``point.npz`` of ``point.pca``, and copy ``mean.obj`` from beside it, where the backend looks."""
     from soma_backend_garment._point_pca import read_pca, write_npz
 
+    native, mean = _folder() / "mean.obj", source.with_name("mean.obj")
     target = output or _model()
     if target.suffix.lower() != ".npz":
         raise InputError("--output", got=str(target), expected="an .npz", fix="Leave it out.")
     write_npz(target, read_pca(source), source=source)
-    return [target]
+    if native.exists() or not mean.is_file():
+        return [target]
+    atomic_write(native, lambda temporary: shutil.copyfile(mean, temporary) and None)
+    return [target, native]

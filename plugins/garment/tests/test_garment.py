@@ -60,6 +60,15 @@ def test_bodies_follow_the_formula(arrays):
         np.testing.assert_allclose(found, expected.reshape(-1, 3), atol=ROUNDING, rtol=0)
 
 
+def test_the_mean_body_comes_along(tmp_path, arrays, data_folder):
+    source = write_pca(tmp_path / "point.pca", *arrays)
+    (tmp_path / "mean.obj").write_text("v 0 0 0\n")
+    copied = data_folder / "mean.obj"
+    assert garment.soma_convert(source, None) == [data_folder / "point.npz", copied]
+    assert copied.read_text() == "v 0 0 0\n"
+    assert garment.soma_convert(source, None) == [data_folder / "point.npz"]
+
+
 @pytest.mark.parametrize(
     ("header", "cause"),
     [
