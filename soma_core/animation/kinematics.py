@@ -129,7 +129,7 @@ class Kinematics(torch.nn.Module):
         return turns @ self.orient, positions
 
     def bind_positions(self, offsets: Tensor, hips: Tensor) -> Tensor:
-        """Joint positions (B, J, 3) [m] in the bind pose, whose turns are constants; see :meth:`positions`."""
+        """Joint positions (B, J, 3) [m] in the bind pose, whose turns are constant; see :meth:`positions`."""
         return self.positions(self.bind_parent_turn, offsets, hips)
 
     def positions(self, parent_turns: Tensor, offsets: Tensor, hips: Tensor) -> Tensor:
