@@ -31,7 +31,7 @@ RANKS = [
     {"backends", "io"},
     {"layer"},
     {"inversion"},
-    {"config", "shape_space", "template", "testing"},
+    {"config", "registration", "shape_space", "template", "testing"},
     {"evaluation"},
     {"tasks"},
     {"cli"},

@@ -31,6 +31,7 @@ __all__ = [
     "TrainShapeConfig",
     "Translation",
     "Upward",
+    "WrapConfig",
     "register_schemas",
 ]
 
@@ -258,6 +259,23 @@ class BenchConfig:
     seed: int = 0
 
 
+@dataclass
+class WrapConfig:
+    """Configuration of ``soma wrap``."""
+
+    native: str | None = None
+    backend: str | None = None
+    out: str | None = None
+    unit: LengthUnit | None = None
+    up: str | None = None
+    forward: str | None = None
+    fill: list[str] = field(default_factory=lambda: ["eye_bags", "mouth_bag", "between_toes"])
+    symmetric: bool | None = None
+    landmarks: str | None = None
+    mask: str | None = None
+    picture: bool = True
+
+
 def register_schemas() -> None:
     """Make the schemas known to hydra under ``<task>_schema``; safe to call again."""
     store = ConfigStore.instance()
@@ -267,5 +285,6 @@ def register_schemas() -> None:
         ("train_shape", TrainShapeConfig),
         ("evaluate", EvaluateConfig),
         ("bench", BenchConfig),
+        ("wrap", WrapConfig),
     ):
         store.store(name=f"{task}_schema", node=schema)

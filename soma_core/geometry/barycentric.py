@@ -94,15 +94,16 @@ def closest_point_on_triangle(points: np.ndarray, corners: np.ndarray) -> np.nda
     a, b, c = corners[:, 0], corners[:, 1], corners[:, 2]
     candidates = [_on_segment(points, *edge) for edge in ((a, b), (b, c), (c, a))]
     inside, plane = _on_plane(points, a, b - a, c - a)
-    distances = np.stack([((points - candidate) ** 2).sum(1) for candidate in candidates])
+    offsets = [points - candidate for candidate in candidates]
+    distances = np.stack([_dot(offset, offset) for offset in offsets])
     best = np.stack(candidates)[distances.argmin(0), np.arange(len(points))]
     return np.where(inside[:, None], plane, best)
 
 
 def _on_segment(points: np.ndarray, start: np.ndarray, end: np.ndarray) -> np.ndarray:
     along = end - start
-    squared = (along * along).sum(1)
-    t = np.divide(((points - start) * along).sum(1), squared, out=np.zeros(len(points)), where=squared > 0)
+    squared = _dot(along, along)
+    t = np.divide(_dot(points - start, along), squared, out=np.zeros(len(points)), where=squared > 0)
     return start + np.clip(t, 0, 1)[:, None] * along
 
 
@@ -110,10 +111,15 @@ def _on_plane(
     points: np.ndarray, origin: np.ndarray, first: np.ndarray, second: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     normal = np.cross(first, second)
-    squared = (normal * normal).sum(1)
+    squared = _dot(normal, normal)
     offset = points - origin
     safe = np.where(squared > 0, squared, 1.0)
-    u = (np.cross(offset, second) * normal).sum(1) / safe
-    v = (np.cross(first, offset) * normal).sum(1) / safe
+    u = _dot(np.cross(offset, second), normal) / safe
+    v = _dot(np.cross(first, offset), normal) / safe
     inside = (u >= 0) & (v >= 0) & (u + v <= 1) & (squared > 0)
     return inside, origin + u[:, None] * first + v[:, None] * second
+
+
+def _dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Products of rows (n, 3), several times faster than a sum over so short an axis."""
+    return np.einsum("nc,nc->n", a, b)

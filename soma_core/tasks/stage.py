@@ -18,7 +18,7 @@ from soma_core.io.clip import vertex_normals
 if TYPE_CHECKING:
     from PIL.Image import Image
 
-__all__ = ["AZIMUTH", "PAPER", "VIEW_ANGLE", "Body", "Stage", "camera_axes", "open_stage"]
+__all__ = ["AZIMUTH", "PAPER", "VIEW_ANGLE", "Body", "Stage", "camera_axes", "open_stage", "quiet_display"]
 
 PAPER = (0.965, 0.965, 0.96)
 """Colour of the background, sRGB in 0..1."""
@@ -65,7 +65,7 @@ def open_stage(size: tuple[int, int]) -> Iterator[Stage]:
             "pictures need pyvista, which is not installed. Run: pip install 'soma-body-core[render]' "
             "(or leave png out of write=[...])."
         ) from error
-    with _quiet_display():
+    with quiet_display():
         stage = Stage(pyvista, (size[0] * _OVERSAMPLING, size[1] * _OVERSAMPLING))
     try:
         yield stage
@@ -74,7 +74,7 @@ def open_stage(size: tuple[int, int]) -> Iterator[Stage]:
 
 
 @contextmanager
-def _quiet_display() -> Iterator[None]:
+def quiet_display() -> Iterator[None]:
     """VTK warns on stderr before it falls back from a missing X server to EGL or software: silence that."""
     from vtkmodules.vtkCommonCore import vtkLogger
 
@@ -121,7 +121,7 @@ class Stage:
         actors = [self._add_body(body) for body in bodies]
         actors.append(self._add_floor(bodies))
         self._aim(np.asarray(focus, float), height, azimuth=0.0 if flat else AZIMUTH)
-        with _quiet_display():
+        with quiet_display():
             self._plotter.render()
             pixels = self._plotter.screenshot(return_img=True)
         for actor in actors:

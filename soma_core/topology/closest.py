@@ -43,7 +43,8 @@ class ClosestFaces:
         scale = float(np.abs(self._vertices - centre).max()) or 1.0
         query, face = self._touching(proposed)
         closest = closest_point_on_triangle(points[query], self._vertices[self._triangles[face]])
-        squared = ((points[query] - closest) ** 2).sum(1)
+        offset = points[query] - closest
+        squared = np.einsum("nc,nc->n", offset, offset)
         nearest = np.full(len(points), np.inf)
         np.minimum.at(nearest, query, squared)
         slack = 1e-12 * scale * scale

@@ -1,0 +1,87 @@
+"""Which way a body stands and looks: every axis choice is tried with our own mean body."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import product
+from typing import cast
+
+import numpy as np
+
+from soma_core.errors import InputError
+from soma_core.plugin.spec import Axis, Unit
+from soma_core.registration.body_model import BodyModel, BodyPose
+from soma_core.registration.surface import Surface
+from soma_core.registration.target import Frame, Skin, find_unit
+
+__all__ = ["Start", "find_starts"]
+
+_ARMS = (0.0, 0.5, 1.0, 1.4)
+"""Poses that are tried, on the way from the T-pose (0) to the bind pose (1)."""
+
+_SAMPLES = 1200
+_SOFT = 0.08
+"""Distance [m] at which a sample counts half."""
+
+_AXES: tuple[Axis, ...] = ("+y", "+z", "-z", "+x", "-x", "-y")
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Start:
+    """A frame of the native mesh and a pose of the mean body in it; a lower cost fits better."""
+
+    frame: Frame
+    pose: BodyPose
+    cost: float
+
+
+def find_starts(
+    skin: Skin, model: BodyModel, *, unit: Unit | None, up: Axis | None, forward: Axis | None, count: int
+) -> list[Start]:
+    """The `count` best ways to stand the mean body into the mesh, best first.
+
+    Raises:
+        InputError: no unit gives a person's size, or `up` and `forward` are parallel.
+    """
+    extent = np.ptp(skin.vertices, axis=0)
+    unit = unit or find_unit(float(extent.max()))
+    centre = cast("tuple[float, float, float]", tuple((skin.vertices.max(0) + skin.vertices.min(0)) / 2))
+    bodies = [(share, *_mean_body(model, share)) for share in _ARMS]
+    starts = []
+    for high, ahead in product([up] if up else _AXES, [forward] if forward else _AXES):
+        if high[1] == ahead[1]:
+            continue
+        frame = Frame(unit=unit, up=high, forward=ahead, centre=centre)
+        surface = skin.surface(frame)
+        starts += [_start(surface, frame, model, *body) for body in bodies]
+    if not starts:
+        raise InputError(
+            "forward", got=repr(forward), expected=f"an axis across up={up!r}", fix="Correct one of the two."
+        )
+    return sorted(starts, key=lambda start: start.cost)[:count]
+
+
+def _mean_body(model: BodyModel, share: float) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices and normals around the origin."""
+    vertices, _ = model.evaluate(model.start(share))
+    own = Surface(vertices, model.triangles)
+    return vertices, own.normals
+
+
+def _start(
+    surface: Surface, frame: Frame, model: BodyModel, share: float, vertices: np.ndarray, normals: np.ndarray
+) -> Start:
+    """Place the mean body by its box, and measure both ways."""
+    size = np.ptp(surface.vertices[:, 1]) / np.ptp(vertices[:, 1])
+    middle = (vertices.max(0) + vertices.min(0)) / 2
+    placed = size * (vertices - middle)
+    ids = model.skin[:: max(1, len(model.skin) // _SAMPLES)]
+    there = surface.facing(placed[ids], normals[ids])
+    gap = np.linalg.norm(there.points - placed[ids], axis=1)
+    own = Surface(placed, model.triangles)
+    chosen = np.arange(0, len(surface.vertices), max(1, len(surface.vertices) // _SAMPLES))
+    here = own.facing(surface.vertices[chosen], surface.normals[chosen])
+    back = np.linalg.norm(here.points - surface.vertices[chosen], axis=1)
+    cost = sum(float((d**2 / (d**2 + _SOFT**2)).mean()) for d in (gap, back))
+    pose = model.start(share)
+    return Start(frame=frame, pose=pose.at(pose.hips - middle), cost=cost)

@@ -1,0 +1,220 @@
+"""Fit our own parametric body to a surface: shape, pose and place by Gauss-Newton on closest points.
+
+Model vertices are drawn to the surface and points of the surface to the model, both along normals, so that
+the model may slide while it settles. Residuals far beyond the current scale count little (Geman-McClure),
+and the scale shrinks.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.linalg
+from scipy.spatial.transform import Rotation
+
+from soma_core.registration.body_model import BodyModel, BodyPose
+from soma_core.registration.surface import Surface
+
+__all__ = ["BodyFit", "fit_body"]
+
+_SHAPE_STRENGTH = 2e-3
+"""Residual [m] of all vertices that one standard deviation of a component is worth."""
+
+_POSE_STRENGTH = 6e-3
+"""Residual [m] of all vertices that a turn of one radian is worth at strength 1."""
+
+_FACING = 0.3
+"""Cosine between normals below which two surfaces do not belong together."""
+
+_TANGENT = 0.1
+"""Weight of the distance along the surface: little, so that parts slide into place."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class BodyFit:
+    """What came out.
+
+    Attributes:
+        pose: the parameters.
+        vertices: (v, 3) [m] of the model's LOD.
+        cost: mean robust distance both ways, for comparing starts.
+    """
+
+    pose: BodyPose
+    vertices: np.ndarray
+    cost: float
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Pull:
+    """Points of the model (convex combinations of vertices) and where they should be.
+
+    Attributes:
+        vertices, shares: (m, 3) ids and weights.
+        points: (m, 3) where the combinations are now.
+        targets, normals: (m, 3).
+        weights: (m,).
+    """
+
+    vertices: np.ndarray
+    shares: np.ndarray
+    points: np.ndarray
+    targets: np.ndarray
+    normals: np.ndarray
+    weights: np.ndarray
+
+
+def fit_body(
+    model: BodyModel,
+    surface: Surface,
+    start: BodyPose,
+    *,
+    scales: Iterator[float] | list[float],
+    shaped: bool = True,
+    ends: float = 1.0,
+    samples: int = 3000,
+    landmarks: tuple[np.ndarray, np.ndarray] | None = None,
+) -> BodyFit:
+    """Fit from one start, one Gauss-Newton step for each entry of `scales`.
+
+    Args:
+        model: the body.
+        surface: the target [m], +Y up, +Z forward.
+        start: where to begin; its pose is the one the prior pulls to.
+        scales: distances [m] beyond which residuals count little, one a step.
+        shaped: fit the shape too.
+        ends: factor of the pull of fingers and feet to their start.
+        samples: how many points of the surface are drawn to the model.
+        landmarks: ids of vertices of the model's LOD and their positions (m, 3).
+    """
+    stride = max(1, len(surface.vertices) // samples)
+    chosen = np.arange(0, len(surface.vertices), stride)
+    pose, derivative, cost = start, None, np.inf
+    for number, scale in enumerate(scales):
+        vertices, joints = model.evaluate(pose)
+        if shaped and number % 4 == 0:
+            derivative = model.shape_derivative(pose)
+        pulls = [*_pulls(model, surface, vertices, chosen, scale)]
+        cost = float(np.mean([_robust_cost(pull, scale) for pull in pulls]))
+        if landmarks is not None:
+            pulls.append(_landmark_pull(vertices, *landmarks))
+        step = _step(model, pose, start, vertices, joints, derivative, pulls, ends)
+        pose = model.moved_by(pose, step)
+    vertices, _ = model.evaluate(pose)
+    return BodyFit(pose=pose, vertices=vertices, cost=cost)
+
+
+def _robust_cost(pull: _Pull, scale: float) -> float:
+    squared = ((pull.points - pull.targets) ** 2).sum(1)
+    return float(np.mean(squared / (squared + scale**2)))
+
+
+def _pulls(
+    model: BodyModel, surface: Surface, vertices: np.ndarray, chosen: np.ndarray, scale: float
+) -> Iterator[_Pull]:
+    own = Surface(vertices, model.triangles)
+    ids = model.skin
+    there = surface.facing(vertices[ids], own.normals[ids])
+    yield _Pull(
+        vertices=np.repeat(ids[:, None], 3, 1), shares=np.tile([1.0, 0.0, 0.0], (len(ids), 1)),
+        points=vertices[ids], targets=there.points, normals=there.normals,
+        weights=_weights(vertices[ids], there.points, own.normals[ids], there.normals, scale),
+    )  # fmt: skip
+    points, normals = surface.vertices[chosen], surface.normals[chosen]
+    here = own.facing(points, normals)
+    weights = _weights(here.points, points, here.normals, normals, scale)
+    yield _Pull(
+        vertices=model.triangles[here.faces], shares=here.shares, points=here.points,
+        targets=points, normals=normals, weights=weights * len(ids) / max(len(chosen), 1),
+    )  # fmt: skip
+
+
+def _weights(
+    points: np.ndarray, targets: np.ndarray, normals: np.ndarray, others: np.ndarray, scale: float
+) -> np.ndarray:
+    squared = ((points - targets) ** 2).sum(1)
+    agree = np.clip(((normals * others).sum(1) - _FACING) / (1 - _FACING), 0, 1)
+    return agree * (scale**2 / (squared + scale**2)) ** 2
+
+
+def _landmark_pull(vertices: np.ndarray, ids: np.ndarray, targets: np.ndarray) -> _Pull:
+    """Landmarks, three times with one axis each as the normal."""
+    axes = np.repeat(np.eye(3), len(ids), 0)
+    ids, targets = np.tile(ids, 3), np.tile(targets, (3, 1))
+    return _Pull(
+        vertices=np.repeat(ids[:, None], 3, 1), shares=np.tile([1.0, 0.0, 0.0], (len(ids), 1)),
+        points=vertices[ids], targets=targets, normals=axes, weights=np.full(len(ids), 30.0),
+    )  # fmt: skip
+
+
+def _step(
+    model: BodyModel,
+    pose: BodyPose,
+    start: BodyPose,
+    vertices: np.ndarray,
+    joints: np.ndarray,
+    derivative: np.ndarray | None,
+    pulls: list[_Pull],
+    ends: float,
+) -> np.ndarray:
+    """Solve the normal equations of all pulls and priors."""
+    count, free = len(model.joints), 0 if derivative is None else model.count
+    size = 3 * count + 3 + free
+    matrix, right = np.zeros((size, size)), np.zeros(size)
+    lever = vertices[:, None] - joints[None, model.joints]
+    for pull in pulls:
+        offset = pull.targets - pull.points
+        moved = np.einsum("mk,mkj->mj", pull.shares, model.moved[pull.vertices][..., model.joints])
+        arms = np.einsum("mk,mkjc->mjc", pull.shares, lever[pull.vertices])
+        for directions, weight in _directions(pull.normals):
+            rows = np.zeros((len(offset), size))
+            turned = moved[..., None] * np.cross(arms, directions[:, None])
+            rows[:, : 3 * count] = turned.reshape(len(offset), -1)
+            rows[:, 3 * count : 3 * count + 3] = directions
+            if derivative is not None:
+                along = np.einsum("kmac,ma,mc->mk", derivative[:, pull.vertices], pull.shares, directions)
+                rows[:, 3 * count + 3 :] = along
+            weighed = rows * (weight * pull.weights)[:, None]
+            matrix += weighed.T @ rows
+            right += weighed.T @ (offset * directions).sum(1)
+    _add_priors(model, pose, start, matrix, right, free, ends)
+    solved = scipy.linalg.cho_solve(scipy.linalg.cho_factor(matrix), right)
+    return solved if free else np.concatenate([solved, np.zeros(model.count)])
+
+
+def _directions(normals: np.ndarray) -> Iterator[tuple[np.ndarray, float]]:
+    """The normal, and with little weight the three axes."""
+    yield normals, 1.0
+    for axis in np.eye(3):
+        yield np.broadcast_to(axis, normals.shape), _TANGENT**2
+
+
+def _add_priors(
+    model: BodyModel,
+    pose: BodyPose,
+    start: BodyPose,
+    matrix: np.ndarray,
+    right: np.ndarray,
+    free: int,
+    ends: float,
+) -> None:
+    """Pull rotations to their start and the shape to the mean; a little damping for all."""
+    count, scale = len(model.joints), len(model.skin)
+    world = model.world_turns(pose)
+    for place, joint in enumerate(model.joints):
+        above = world[model.parents[joint]] if joint else np.eye(3)
+        away = Rotation.from_matrix(pose.rotations[joint] @ start.rotations[joint].T).as_rotvec()
+        stiffness = model.stiffness[place] * (ends if model.ends[place] else 1.0)
+        strength = scale * (_POSE_STRENGTH * stiffness) ** 2
+        block = slice(3 * place, 3 * place + 3)
+        matrix[block, block] += strength * np.eye(3)
+        right[block] -= strength * (above @ away)
+    if free:
+        strength = scale * _SHAPE_STRENGTH**2 / model.count
+        matrix[-free:, -free:] += strength * np.eye(free)
+        right[-free:] -= strength * pose.shape
+    matrix[np.diag_indices_from(matrix)] += (
+        1e-6 * scale * np.concatenate([np.full(3 * count, 0.1), np.full(3, 1.0), np.full(free, 1e-3)])
+    )

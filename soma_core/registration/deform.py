@@ -1,0 +1,145 @@
+"""Non-rigid registration: a smooth displacement of the fitted body onto the surface, stiff to supple.
+
+The displacement d of all vertices minimises ``sum w (d - t)^2 + stiffness |K d|^2`` with the graph Laplacian
+K. Targets t lie along the surface's normals, so that vertices slide where the smoothness wants them to;
+points of the surface pull at the faces they are nearest to. Each step solves one sparse system.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.sparse
+from scipy.sparse.linalg import splu
+
+from soma_core.io.clip import vertex_normals
+from soma_core.registration.surface import Surface
+
+__all__ = ["Smoothness", "deform", "project"]
+
+_FACING = 0.5
+"""Cosine between normals below which two surfaces do not belong together."""
+
+_BACKWARD = 0.5
+"""Weight of the surface's points against the mesh's vertices."""
+
+_LANDMARK = 100.0
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Smoothness:
+    """Graph Laplacian of a mesh and its square; rows sum to zero.
+
+    Attributes:
+        triangles: (t, 3).
+        laplacian: (v, v), identity less the mean of the neighbours.
+        energy: (v, v), its normal matrix.
+    """
+
+    triangles: np.ndarray
+    laplacian: scipy.sparse.csr_array
+    energy: scipy.sparse.csr_array
+
+    @classmethod
+    def of(cls, triangles: np.ndarray, count: int) -> Smoothness:
+        """Build it from the triangles of a mesh of `count` vertices."""
+        ends = np.concatenate([triangles[:, [i, (i + 1) % 3]] for i in range(3)])
+        graph = scipy.sparse.csr_array((np.ones(len(ends)), tuple(ends.T)), shape=(count, count))
+        graph = ((graph + graph.T) > 0).astype(float)
+        degree = np.maximum(np.asarray(graph.sum(1)).ravel(), 1)
+        laplacian = (scipy.sparse.eye_array(count) - scipy.sparse.diags_array(1 / degree) @ graph).tocsr()
+        return cls(triangles=triangles, laplacian=laplacian, energy=(laplacian.T @ laplacian).tocsr())
+
+
+def deform(
+    start: np.ndarray,
+    surface: Surface,
+    smooth: Smoothness,
+    *,
+    free: np.ndarray,
+    reaches: Sequence[float],
+    scale: float,
+    landmarks: tuple[np.ndarray, np.ndarray] | None = None,
+    begin: np.ndarray | None = None,
+    trust: np.ndarray | None = None,
+) -> np.ndarray:
+    """Move `start` onto the surface, one linear solve for each entry of `reaches`.
+
+    Args:
+        start: (v, 3) [m].
+        surface: the target.
+        smooth: of the mesh of `start`.
+        free: (v,) whether a vertex has no counterpart and only follows.
+        reaches: lengths in edges over which the displacement is smooth; the stiffness is their fourth power.
+        scale: distance [m] beyond which a closest point counts little.
+        landmarks: vertex ids and positions.
+        begin: (v, 3) where closest points are looked for first; default `start`.
+        trust: (v,) factors of the pull of the surface; default 1.
+    """
+    vertices, count = start if begin is None else begin, len(start)
+    trust = np.ones(count) if trust is None else trust
+    for reach in reaches:
+        weights, targets = _forward(vertices, surface, smooth.triangles, free, scale)
+        weights = weights * trust
+        matrix = scipy.sparse.diags_array(weights) + reach**4 * smooth.energy
+        right = weights[:, None] * (targets - start)
+        pull, wanted, held = _backward(vertices, surface, smooth.triangles, free, scale)
+        held = _BACKWARD * held * (pull @ trust) * min(1.0, count / max(len(held), 1))
+        matrix = matrix + pull.T @ scipy.sparse.diags_array(held) @ pull
+        right += pull.T @ (held[:, None] * (wanted - pull @ start))
+        if landmarks is not None:
+            ids, places = landmarks
+            mark = np.zeros(count)
+            mark[ids] = _LANDMARK
+            matrix = matrix + scipy.sparse.diags_array(mark)
+            right[ids] += _LANDMARK * (places - start[ids])
+        vertices = start + splu(
+            matrix.tocsc(), permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True}
+        ).solve(right)
+    return vertices
+
+
+def _forward(
+    vertices: np.ndarray, surface: Surface, triangles: np.ndarray, free: np.ndarray, scale: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Weights (v,) and targets (v, 3) of the vertices themselves."""
+    normals = vertex_normals(vertices, triangles)
+    contact = surface.facing(vertices, normals)
+    offset = contact.points - vertices
+    along = (offset * contact.normals).sum(1)
+    weights = _agreement(offset, normals, contact.normals, scale)
+    weights[free] = 0
+    return weights, vertices + along[:, None] * contact.normals
+
+
+def _backward(
+    vertices: np.ndarray, surface: Surface, triangles: np.ndarray, free: np.ndarray, scale: float
+) -> tuple[scipy.sparse.csr_array, np.ndarray, np.ndarray]:
+    """Matrix (m, v) of the mesh's points nearest to the surface's vertices, their targets and weights."""
+    own = Surface(vertices, triangles)
+    contact = own.facing(surface.vertices, surface.normals)
+    offset = surface.vertices - contact.points
+    along = (offset * contact.normals).sum(1)
+    weights = _agreement(offset, contact.normals, surface.normals, scale)
+    corners = triangles[contact.faces]
+    weights[free[corners].any(1)] = 0
+    rows = np.repeat(np.arange(len(offset)), 3)
+    matrix = scipy.sparse.csr_array(
+        (contact.shares.ravel(), (rows, corners.ravel())), shape=(len(offset), len(vertices))
+    )
+    return matrix, contact.points + along[:, None] * contact.normals, weights
+
+
+def _agreement(offset: np.ndarray, normals: np.ndarray, others: np.ndarray, scale: float) -> np.ndarray:
+    squared = (offset**2).sum(1)
+    agree = np.clip(((normals * others).sum(1) - _FACING) / (1 - _FACING), 0, 1)
+    return agree * (scale**2 / (squared + scale**2)) ** 2
+
+
+def project(vertices: np.ndarray, surface: Surface, smooth: Smoothness, *, free: np.ndarray) -> np.ndarray:
+    """Put every vertex that is not free on the surface, on a face that looks the same way."""
+    normals = vertex_normals(vertices, smooth.triangles)
+    contact = surface.facing(vertices, normals)
+    return np.where(free[:, None], vertices, contact.points)

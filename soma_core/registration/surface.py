@@ -1,0 +1,83 @@
+"""A surface that is asked for its closest points of the same orientation."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from soma_core.geometry.barycentric import closest_point_on_triangle
+from soma_core.io.clip import vertex_normals
+from soma_core.topology.closest import ClosestFaces
+
+__all__ = ["Contact", "Surface"]
+
+_TURN = 0.04
+"""Length [m] that a unit difference of normals counts for: between the sides of a gap, the right one wins."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Contact:
+    """Where points touch a surface.
+
+    Attributes:
+        points: (m, 3) closest points.
+        normals: (m, 3) unit normals there, interpolated between vertices.
+        faces: (m,) face ids.
+        shares: (m, 3) barycentric coordinates in the face.
+    """
+
+    points: np.ndarray
+    normals: np.ndarray
+    faces: np.ndarray
+    shares: np.ndarray
+
+
+class Surface:
+    """A triangle mesh prepared for closest points.
+
+    Args:
+        vertices: (n, 3) [m].
+        triangles: (t, 3), counter-clockwise seen from outside.
+    """
+
+    def __init__(self, vertices: np.ndarray, triangles: np.ndarray) -> None:
+        self.vertices, self.triangles = vertices, triangles
+        self.normals = vertex_normals(vertices, triangles)
+        corners = vertices[triangles]
+        normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        self.face_normals = normals / np.maximum(np.linalg.norm(normals, axis=1), 1e-300)[:, None]
+        self._tree = cKDTree(np.hstack([corners.mean(1), _TURN * self.face_normals]))
+        self._exact = ClosestFaces(vertices, triangles)
+
+    def facing(self, points: np.ndarray, normals: np.ndarray) -> Contact:
+        """Closest points (m) among faces turned like `normals`: a finger does not touch its neighbour."""
+        _, proposed = self._tree.query(np.hstack([points, _TURN * normals]))
+        faces = self._exact.nearest_touching(points, proposed)
+        moved = np.flatnonzero(faces != proposed)
+        faces[moved] = self._exact.nearest_touching(points[moved], faces[moved])
+        return self._contact(points, faces)
+
+    def closest(self, points: np.ndarray) -> Contact:
+        """Closest points (m) whatever the orientation."""
+        return self._contact(points, self._exact.query(points))
+
+    def _contact(self, points: np.ndarray, faces: np.ndarray) -> Contact:
+        corners = self.vertices[self.triangles[faces]]
+        touched = closest_point_on_triangle(points, corners)
+        shares = _shares(touched, corners)
+        normals = np.einsum("mk,mkc->mc", shares, self.normals[self.triangles[faces]])
+        normals /= np.maximum(np.linalg.norm(normals, axis=1), 1e-300)[:, None]
+        return Contact(points=touched, normals=normals, faces=faces, shares=shares)
+
+
+def _shares(points: np.ndarray, corners: np.ndarray) -> np.ndarray:
+    """Barycentric coordinates (m, 3) of points in the planes of triangles."""
+    first, second = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+    offset = points - corners[:, 0]
+    normal = np.cross(first, second)
+    squared = np.maximum((normal * normal).sum(1), 1e-300)
+    u = (np.cross(offset, second) * normal).sum(1) / squared
+    v = (np.cross(first, offset) * normal).sum(1) / squared
+    return np.clip(np.stack([1 - u - v, u, v], 1), 0, 1)
