@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import io
 import lzma
 import math
 import struct
+import tokenize
 import zipfile
 import zlib
 from collections.abc import Iterator
@@ -26,6 +28,7 @@ _DAMAGE = (
 )  # fmt: skip
 """What zipfile and numpy raise for files that are not what they say. RuntimeError: encrypted members."""
 
+_LONGEST_HEADER = 10_000  # as numpy itself
 _BLOCK = 2**20
 _SMALL = 256 * 2**20
 _MOST_EXPANSION = 64
@@ -58,8 +61,13 @@ def read_array_header(stream: IO[bytes]) -> ArrayHeader:
         readers = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
         if version not in readers:
             raise ValueError(f"NPY version {version}")
-        shape, fortran, dtype = readers[version](stream)
-    except _DAMAGE as error:
+        width = 2 if version == (1, 0) else 4
+        size = stream.read(width)
+        length = int.from_bytes(size, "little")
+        if length > _LONGEST_HEADER:
+            raise ValueError(f"a header of {length} bytes")
+        shape, fortran, dtype = readers[version](io.BytesIO(size + stream.read(length)))
+    except (*_DAMAGE, tokenize.TokenError) as error:
         raise ValueError(f"{error or type(error).__name__}"[:200]) from error
     if dtype.hasobject:
         raise ValueError("Python objects, which can run code")

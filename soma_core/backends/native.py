@@ -5,7 +5,6 @@ It is found, declared and built through the same hooks as every other backend.
 
 from __future__ import annotations
 
-import zipfile
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from soma_core.errors import AssetError
+from soma_core.npz import open_npz_file
 from soma_core.paths import assets_dir
 from soma_core.plugin.hookspecs import hookimpl
 from soma_core.plugin.spec import BackendSpec, Generator, LinearBasis, Parameter
@@ -33,18 +33,13 @@ def component_count(path: Path) -> int:
     Raises:
         AssetError: the file is missing, damaged, or holds no shape space.
     """
-    try:
-        with zipfile.ZipFile(path) as archive, archive.open("eigenvalues.npy") as stream:
-            major, _ = np.lib.format.read_magic(stream)
-            read_header = {1: np.lib.format.read_array_header_1_0, 2: np.lib.format.read_array_header_2_0}
-            shape, _, _ = read_header[major](stream)
-            (count,) = shape
-    except (OSError, KeyError, ValueError, zipfile.BadZipFile) as error:
-        raise AssetError(
-            path,
-            cause=f"no shape space can be read ({type(error).__name__}: {error})",
-            fix="Restore it with `git checkout -- assets`, or make it again with `soma assets build`",
-        ) from error
+    fix = "Restore it with `git checkout -- assets`, or make it again with `soma assets build`"
+    with open_npz_file(path, fix=fix) as file:
+        try:
+            (count,) = file.header("eigenvalues").shape
+        except (KeyError, ValueError) as error:
+            cause = f"no shape space can be read ({type(error).__name__}: {error})"
+            raise AssetError(path, cause=cause, fix=fix) from error
     return int(count)
 
 

@@ -13,6 +13,10 @@ __all__ = ["GlbFile"]
 
 _COMPONENTS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 _SHAPES: dict[str, tuple[int, ...]] = {"SCALAR": (), "VEC2": (2,), "VEC3": (3,), "VEC4": (4,), "MAT4": (4, 4)}
+_MOST_NODES = 100_000
+_SMALL, _MOST_EXPANSION = 256 * 2**20, 64
+"""Bytes that any file may unfold to, and times its size that a large one may."""
+
 _HARMLESS = ("KHR_materials_", "KHR_texture_")
 """Extensions that change how a body looks, not where it is."""
 
@@ -36,11 +40,19 @@ class GlbFile:
             raise ValueError(f"its first chunk is {kind!r}, not JSON")
         self.document: dict[str, Any] = json.loads(self._data[20 : 20 + size].tobytes())
         self._begin = 28 + size
+        if len(self.document.get("nodes", ())) > _MOST_NODES:
+            raise ValueError(f"it holds {len(self.document['nodes'])} nodes, more than {_MOST_NODES}")
         needed = [
             name for name in self.document.get("extensionsRequired", []) if not name.startswith(_HARMLESS)
         ]
         if needed:
             raise ValueError(f"it needs the extension {needed[0]}")
+
+    def check_expansion(self, size: int, what: str) -> None:
+        """Refuse to unfold to `size` bytes where the file is too small to mean it."""
+        most = max(_SMALL, _MOST_EXPANSION * len(self._data))
+        if size > most:
+            raise ValueError(f"{what} take {size} bytes; at most {most} are read of a file of its size")
 
     def accessor(self, index: int) -> np.ndarray:
         """Values of an accessor, (count, ...); matrices as column-vector transforms (count, 4, 4)."""

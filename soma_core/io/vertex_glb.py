@@ -94,8 +94,9 @@ class _MovingMesh:
         kept = slice(_canonical_count(document))
         self._rest = file.accessor(primitive["attributes"]["POSITION"])[kept].astype(np.float64)
         self.vertex_count = len(self._rest)
-        targets = [file.accessor(target["POSITION"])[kept] for target in primitive.get("targets", ())]
-        self._targets = np.array(targets, np.float64)
+        targets = primitive.get("targets", ())
+        file.check_expansion(24 * len(targets) * self.vertex_count, f"{len(targets)} morph targets")
+        self._targets = np.array([file.accessor(each["POSITION"])[kept] for each in targets], np.float64)
         self._joints = np.empty(0, int)
         if "skin" in document["nodes"][node]:
             self._read_skin(file, document["skins"][document["nodes"][node]["skin"]], primitive, kept)

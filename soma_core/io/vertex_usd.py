@@ -57,7 +57,9 @@ class UsdSequence(VertexSequence):
         prim = self._points.GetPrim()
         if self._skin is not None:
             query, skeleton = self._skin
-            query.ComputeSkinnedPoints(skeleton.ComputeSkinningTransforms(time), points, time)
+            if not query.ComputeSkinnedPoints(skeleton.ComputeSkinningTransforms(time), points, time):
+                cause = f"the joint indices or weights of {prim.GetPath()} do not fit its skeleton"
+                raise AssetError(self.path, cause=cause, fix="Export the skin again.")
             prim = skeleton.GetPrim()  # skinned points are in the space of the skeleton
         world = np.array(UsdGeom.XformCache(time).GetLocalToWorldTransform(prim))
         # USD multiplies row vectors from the left.

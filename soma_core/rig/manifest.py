@@ -55,7 +55,7 @@ def read_manifest(root: Path) -> Manifest:
     refuse_unreadable(path, fix=_RESTORE)
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise AssetError(path, cause=f"not valid JSON ({error})", fix=_RESTORE) from error
     schema = content.get("schema") if isinstance(content, dict) else None
     if schema != _SCHEMA:

@@ -179,10 +179,10 @@ def load_shape_space(path: Path | str | None = None) -> ShapeSpace:
     metadata = _read_metadata(path, arrays)
     provenance = metadata.get("provenance")
     trained = provenance.get("shape_space") if isinstance(provenance, dict) else None
-    values = {key: np.ascontiguousarray(arrays[key], np.float32) for key in _SHAPE_KEYS}
     try:
+        values = {key: np.ascontiguousarray(arrays[key], np.float32) for key in _SHAPE_KEYS}
         return ShapeSpace(**values, metadata=metadata if trained is None else trained)
-    except InputError as error:
+    except (InputError, ValueError) as error:
         raise AssetError(path, cause=str(error).rstrip("."), fix="Restore the file") from error
 
 

@@ -1,0 +1,243 @@
+"""Every function of the project that reads a file of a user, with a good file for each."""
+
+from __future__ import annotations
+
+import json
+import struct
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from soma_backend_garment import _point_pca as garment
+from soma_backend_smpl._model_file import read_model
+from soma_backend_smpl.family import SMPL
+
+from soma_core.backends.native import component_count
+from soma_core.io import open_vertex_sequence, read_motion
+from soma_core.io.mesh_vertices import read_mesh_vertices
+from soma_core.io.pickled_arrays import read_pickled_arrays
+from soma_core.rig.legacy import read_legacy_rig
+from soma_core.rig.manifest import MANIFEST_NAME, read_manifest
+from soma_core.rig.neutral import load_shape_space, read_topology
+from soma_core.rig.usd import read_usd_rig
+from soma_core.topology.wrap_pair import read_obj
+from tests.standins.pickles import ch, csc, select, write_pickle
+
+__all__ = ["READERS", "Reader"]
+
+FRAMES, COUNT = 3, 5
+
+
+@dataclass(frozen=True, kw_only=True)
+class Reader:
+    """A reader, the suffix of its files, and how to write one that it reads; None: too large to mutate.
+
+    `accepts` names the files that are sound for this reader, which does not read what is wrong with them.
+    NaN marks a vertex that is missing in a sequence.
+    """
+
+    name: str
+    suffix: str
+    read: Callable[[Path], Any]
+    good: Callable[[Path], Any] | None = None
+    accepts: tuple[str, ...] = ()
+
+
+def _frames(path: Path) -> np.ndarray:
+    with open_vertex_sequence(path) as sequence:
+        return sequence.read(0, 1)
+
+
+def _folder(path: Path) -> np.ndarray:
+    """Read a folder that holds the file alone."""
+    folder = path.with_suffix(".d")
+    folder.mkdir(exist_ok=True)
+    inside = folder / path.name
+    inside.unlink(missing_ok=True)
+    inside.symlink_to(path)
+    return _frames(folder)
+
+
+def _manifest(path: Path) -> object:
+    named = path.with_name(MANIFEST_NAME)
+    named.unlink(missing_ok=True)
+    named.symlink_to(path)
+    return read_manifest(path.parent)
+
+
+def _vertices() -> np.ndarray:
+    return np.random.default_rng(0).normal(size=(FRAMES, COUNT, 3)).astype(np.float32)
+
+
+def _write_npz(path: Path, **arrays: object) -> None:
+    with open(path, "wb") as stream:
+        np.savez_compressed(stream, **arrays)
+
+
+def _motion(path: Path) -> None:
+    turns = np.zeros((FRAMES, 77, 3), np.float32)
+    _write_npz(path, poses=turns, transl=turns[:, 0], fps=30.0, unit="meters", convention="t_pose_relative")
+
+
+def _kimodo(path: Path) -> None:
+    turns = np.tile(np.eye(3, dtype=np.float32), (FRAMES, 30, 1, 1))
+    _write_npz(path, local_rot_mats=turns, root_positions=turns[:, 0, 0])
+
+
+def _shape_space(path: Path) -> None:
+    _write_npz(
+        path, mean=_vertices()[0], shapedirs=_vertices()[:2].reshape(2, -1),
+        eigenvalues=np.ones(2, np.float32), metadata=np.array(json.dumps({"units": "cm"})),
+    )  # fmt: skip
+
+
+def _legacy(path: Path) -> None:
+    worlds = np.tile(np.eye(4), (2, 1, 1))
+    _write_npz(
+        path, joint_names=np.array(["Root", "Hips"]), joint_parent_ids=np.array([-1, 0]),
+        bind_pose_world=worlds, t_pose_world=worlds, bind_shape=_vertices()[0],
+        skinning_weights_data=np.ones(COUNT),
+        skinning_weights_indices=np.arange(COUNT), skinning_weights_indptr=np.array([0, 0, COUNT]),
+        skinning_weights_shape=np.array([COUNT, 2]), triangles=np.array([[0, 1, 2], [2, 3, 4]]),
+    )  # fmt: skip
+
+
+def _obj(path: Path) -> None:
+    path.write_text("v 0 0 0\nv 1 0 0 # a\nv 0 1 0\nv 0 0 1\nf 1 2 3\nf 1/1/1 3//2 -1\n")
+
+
+def _ply(path: Path) -> None:
+    head = "ply\nformat binary_little_endian 1.0\nelement vertex 5\nproperty float x\nproperty float y\n"
+    path.write_bytes((head + "property float z\nend_header\n").encode() + _vertices()[0].tobytes())
+
+
+def _glb(path: Path) -> None:
+    points, shift = _vertices()[0], _vertices()[1]
+    times, weights = np.array([0, 0.5], np.float32), np.array([0, 1], np.float32)
+    data, views, accessors = b"", [], []
+    for array, kind in ((points, "VEC3"), (shift, "VEC3"), (times, "SCALAR"), (weights, "SCALAR")):
+        views.append({"buffer": 0, "byteOffset": len(data), "byteLength": array.nbytes})
+        accessors.append(
+            {"bufferView": len(views) - 1, "componentType": 5126, "count": len(array), "type": kind}
+        )
+        data += array.tobytes()
+    channel = {"sampler": 0, "target": {"node": 1, "path": "weights"}}
+    document = {
+        "asset": {"version": "2.0"}, "nodes": [{"children": [1]}, {"mesh": 0}], "accessors": accessors,
+        "meshes": [{"primitives": [{"attributes": {"POSITION": 0}, "targets": [{"POSITION": 1}]}]}],
+        "animations": [{"channels": [channel], "samplers": [{"input": 2, "output": 3}]}],
+        "bufferViews": views, "buffers": [{"byteLength": len(data)}],
+    }  # fmt: skip
+    path.write_bytes(glb_bytes(document, data))
+
+
+def glb_bytes(document: object, data: bytes = b"") -> bytes:
+    """A GLB of a JSON document and a binary chunk."""
+    text = (document if isinstance(document, str) else json.dumps(document)).encode()
+    text += b" " * (-len(text) % 4)
+    chunks = struct.pack("<I4s", len(text), b"JSON") + text + struct.pack("<I4s", len(data), b"BIN\0") + data
+    return struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks
+
+
+def _pickle(path: Path) -> None:
+    numbers = _vertices()[0].astype(float)
+    write_pickle(path, {"a": numbers, "ch": ch(numbers), "select": select(numbers), "csc": csc(numbers)})
+
+
+_USD = """#usda 1.0
+(
+    metersPerUnit = 0.01
+    upAxis = "Y"
+)
+
+def SkelRoot "Body"
+{
+    def Skeleton "Skeleton"
+    {
+        uniform matrix4d[] bindTransforms = [%s, %s]
+        uniform token[] joints = ["Root", "Root/Hips"]
+        uniform matrix4d[] restTransforms = [%s, %s]
+    }
+
+    def Mesh "c_skin_mid" (
+        prepend apiSchemas = ["SkelBindingAPI"]
+    )
+    {
+        int[] faceVertexCounts = [3, 3]
+        int[] faceVertexIndices = [0, 1, 2, 0, 2, 3]
+        point3f[] points = [(0, 0, 0), (1, 0, 0), (0, 1, 0), (0, 0, 1)]
+        int[] primvars:skel:jointIndices = [0, 1, 1, 0] (
+            elementSize = 1
+            interpolation = "vertex"
+        )
+        float[] primvars:skel:jointWeights = [1, 1, 1, 1] (
+            elementSize = 1
+            interpolation = "vertex"
+        )
+        rel skel:skeleton = </Body/Skeleton>
+    }
+}
+"""
+_EYE = "((1, 0, 0, 0), (0, 1, 0, 0), (0, 0, 1, 0), (0, 0, 0, 1))"
+USD = _USD % ((_EYE,) * 4)
+"""A rig of two joints, on which four vertices hang."""
+
+
+def _usd(path: Path) -> None:
+    path.write_text(USD)
+
+
+def _json(path: Path) -> None:
+    path.write_text(json.dumps({"schema": 1, "rig_hash": "a", "rig_revision": "b", "files": {}}))
+
+
+READERS = [
+    Reader(name="wrap pair", suffix=".obj", read=read_obj, good=_obj),
+    Reader(
+        name="mesh obj", suffix=".obj", read=read_mesh_vertices, good=_obj,
+        accepts=(
+            "obj of an index of zero", "obj of an index out of range", "obj of a negative index",
+            "obj of a huge index", "obj of an index of many digits", "obj of no index", "obj of two corners",
+            "obj of no faces", "obj of NaN", "obj of infinity",
+        ),
+    ),
+    Reader(name="mesh ply", suffix=".ply", read=read_mesh_vertices, good=_ply),
+    Reader(name="vertex folder", suffix=".ply", read=_folder, good=_ply),
+    Reader(
+        name="vertices npz", suffix=".npz", read=_frames,
+        good=lambda path: _write_npz(path, vertices=_vertices()), accepts=("npz of NaN",),
+    ),
+    Reader(name="vertices npy", suffix=".npy", read=_frames, good=lambda path: np.save(path, _vertices())),
+    Reader(name="vertices glb", suffix=".glb", read=_frames, good=_glb),
+    Reader(
+        name="vertices usd", suffix=".usda", read=_frames, good=_usd,
+        accepts=(
+            "usda of a repeated joint", "usda of faces out of range", "usda of negative faces",
+            "usda of negative face counts", "usda of weights of NaN", "usda of points of NaN",
+        ),
+    ),
+    Reader(name="vertices usdc", suffix=".usdc", read=_frames),
+    Reader(name="vertices usdz", suffix=".usdz", read=_frames),
+    Reader(name="motion", suffix=".npz", read=read_motion, good=_motion),
+    Reader(name="kimodo motion", suffix=".npz", read=read_motion, good=_kimodo),
+    Reader(name="shape space", suffix=".npz", read=load_shape_space, good=_shape_space),
+    Reader(
+        name="shape space header", suffix=".npz", read=component_count, good=_shape_space,
+        accepts=("npz of invalid text",),
+    ),
+    Reader(name="topology", suffix=".npz", read=read_topology),
+    Reader(name="legacy rig", suffix=".npz", read=read_legacy_rig, good=_legacy),
+    Reader(name="usd rig", suffix=".usda", read=read_usd_rig, good=_usd),
+    Reader(name="manifest", suffix=".json", read=_manifest, good=_json),
+    Reader(
+        name="pickle", suffix=".pkl",
+        read=lambda path: read_pickled_arrays(path, ["a", "ch", "select", "csc", "v_template", "shapedirs"]),
+        good=_pickle, accepts=("pickle of NaN",),
+    ),
+    Reader(name="smpl npz", suffix=".npz", read=lambda path: read_model(path, SMPL)),
+    Reader(name="smpl pkl", suffix=".pkl", read=lambda path: read_model(path, SMPL)),
+    Reader(name="point.pca", suffix=".pca", read=garment.read_pca),
+    Reader(name="point.npz", suffix=".npz", read=garment.read_npz),
+]  # fmt: skip

@@ -1,0 +1,68 @@
+"""No file does harm: each reader refuses each hostile one, with an error that names it and the cause."""
+
+from __future__ import annotations
+
+import pytest
+
+from soma_core.errors import SomaError
+from tests.hostile.corpus import FILES, LINKS
+from tests.hostile.readers import READERS
+
+each_reader = pytest.mark.parametrize("reader", READERS, ids=lambda reader: reader.name)
+KINDS = {".npy": "array", ".usdz": "npz", ".pkl": "pickle", ".pca": "point.pca", ".json": "JSON"}
+"""Suffix -> first word of the names of hostile files of that format, where it is not the suffix."""
+
+FOR_ALL = (
+    "pickle of os.system, protocol 2",
+    "npz of object arrays",
+    "npz bomb",
+    "obj of an index out of range",
+)
+
+
+def files_for(reader):
+    """Hostile files of the reader's own format, those of no format, and some of others."""
+    kinds = {*KINDS.values(), "npz", "obj", "ply", "glb", "usda", "usdc"} - {
+        KINDS.get(reader.suffix, reader.suffix[1:])
+    }
+    return [name for name in FILES if name in FOR_ALL or name.partition(" ")[0] not in kinds]
+
+
+PAIRS = [
+    pytest.param(reader, name, id=f"{reader.name}-{name}") for reader in READERS for name in files_for(reader)
+]
+
+
+@pytest.mark.parametrize(("reader", "name"), PAIRS)
+def test_hostile_files_are_refused(reader, name, tmp_path, guarded):
+    path = tmp_path / f"hostile{reader.suffix}"
+    content = FILES[name]
+    path.write_bytes(content if isinstance(content, bytes) else content())
+    with guarded():
+        if name in reader.accepts:
+            reader.read(path)
+            return
+        with pytest.raises(SomaError, match=r"(hostile|MANIFEST)[^ ]*: ?\S") as caught:
+            reader.read(path)
+    assert len(str(caught.value)) < 2000
+
+
+@each_reader
+@pytest.mark.parametrize("name", LINKS)
+def test_what_is_no_file_is_refused(reader, name, tmp_path, guarded):
+    path = tmp_path / f"hostile{reader.suffix}"
+    LINKS[name](path)
+    with guarded(), pytest.raises(SomaError, match=r"hostile|MANIFEST"):
+        reader.read(path)
+
+
+@each_reader
+def test_links_to_good_files_are_followed(reader, tmp_path, guarded):
+    if reader.good is None:
+        pytest.skip("no small file of this kind")
+    good = tmp_path / f"good{reader.suffix}"
+    reader.good(good)
+    link = tmp_path / f"hostile{reader.suffix}"
+    link.symlink_to(good)
+    with guarded():
+        reader.read(link)
