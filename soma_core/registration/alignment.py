@@ -46,7 +46,7 @@ def find_starts(
     extent = np.ptp(skin.vertices, axis=0)
     unit = unit or find_unit(float(extent.max()))
     centre = cast("tuple[float, float, float]", tuple((skin.vertices.max(0) + skin.vertices.min(0)) / 2))
-    bodies = [(share, *_mean_body(model, share)) for share in _ARMS]
+    bodies = [(pose := model.start(share), _mean_body(model, pose)) for share in _ARMS]
     starts = []
     for high, ahead in product([up] if up else _AXES, [forward] if forward else _AXES):
         if high[1] == ahead[1]:
@@ -61,27 +61,20 @@ def find_starts(
     return sorted(starts, key=lambda start: start.cost)[:count]
 
 
-def _mean_body(model: BodyModel, share: float) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices and normals around the origin."""
-    vertices, _ = model.evaluate(model.start(share))
-    own = Surface(vertices, model.triangles)
-    return vertices, own.normals
+def _mean_body(model: BodyModel, pose: BodyPose) -> Surface:
+    return Surface(model.evaluate(pose)[0], model.triangles)
 
 
-def _start(
-    surface: Surface, frame: Frame, model: BodyModel, share: float, vertices: np.ndarray, normals: np.ndarray
-) -> Start:
-    """Place the mean body by its box, and measure both ways."""
-    size = np.ptp(surface.vertices[:, 1]) / np.ptp(vertices[:, 1])
-    middle = (vertices.max(0) + vertices.min(0)) / 2
-    placed = size * (vertices - middle)
+def _start(surface: Surface, frame: Frame, model: BodyModel, pose: BodyPose, body: Surface) -> Start:
+    """Place the mean body by its box, scaled to the mesh's height, and measure both ways."""
+    size = np.ptp(surface.vertices[:, 1]) / np.ptp(body.vertices[:, 1])
+    middle = (body.vertices.max(0) + body.vertices.min(0)) / 2
     ids = model.skin[:: max(1, len(model.skin) // _SAMPLES)]
-    there = surface.facing(placed[ids], normals[ids])
-    gap = np.linalg.norm(there.points - placed[ids], axis=1)
-    own = Surface(placed, model.triangles)
+    placed = size * (body.vertices[ids] - middle)
+    gap = surface.facing(placed, body.normals[ids]).points - placed
     chosen = np.arange(0, len(surface.vertices), max(1, len(surface.vertices) // _SAMPLES))
-    here = own.facing(surface.vertices[chosen], surface.normals[chosen])
-    back = np.linalg.norm(here.points - surface.vertices[chosen], axis=1)
-    cost = sum(float((d**2 / (d**2 + _SOFT**2)).mean()) for d in (gap, back))
-    pose = model.start(share)
+    seen = surface.vertices[chosen] / size + middle
+    back = size * (body.facing(seen, surface.normals[chosen]).points - seen)
+    squared = [(offset**2).sum(1) for offset in (gap, back)]
+    cost = sum(float((each / (each + _SOFT**2)).mean()) for each in squared)
     return Start(frame=frame, pose=pose.at(pose.hips - middle), cost=cost)

@@ -119,12 +119,10 @@ class BodyModel:
         return vertices[1:] - vertices[:1]
 
     def _tensors(self, shapes: np.ndarray, pose: BodyPose) -> tuple:
-        kind = {"dtype": self.layer.dtype}
-        rotations = torch.as_tensor(pose.rotations[None], **kind).expand(len(shapes), -1, -1, -1)
-        return (
-            {"shape": torch.as_tensor(shapes, **kind)}, rotations.contiguous(),
-            torch.as_tensor(pose.hips, **kind),
-        )  # fmt: skip
+        dtype = self.layer.dtype
+        rotations = torch.as_tensor(pose.rotations[None], dtype=dtype).expand(len(shapes), -1, -1, -1)
+        hips = torch.as_tensor(pose.hips, dtype=dtype)
+        return {"shape": torch.as_tensor(shapes, dtype=dtype)}, rotations.contiguous(), hips
 
     def world_turns(self, pose: BodyPose) -> np.ndarray:
         """Rotation of each user joint against the T-pose, in the world, (J - 1, 3, 3)."""

@@ -49,6 +49,9 @@ _SYMMETRIC = 1.5e-3
 _NOT_HUMAN = 0.02
 """Mean distance of fitted body and surface, as a share of the stature, beyond which it is no human body."""
 
+_NOTHING_LIKE = 0.04
+"""The same for the rough fit, to say so early."""
+
 _ANCHOR = 1e4
 
 
@@ -121,13 +124,14 @@ def register(
     skin = find_skin(vertices, triangles, masked=options.masked)
     coarse, fine = (BodyModel(SomaLayer("soma", lod=lod)) for lod in ("low", "mid"))
     marks = _landmarks(options, vertices, fine.mesh.vertex_count)
+    filled = _filled(options.fill, fine.mesh)
     fit, frame = _fit_best(skin, coarse, options, marks)
     surface = skin.surface(frame)
+    _refuse_strangers(fit, coarse, surface, share=_NOTHING_LIKE)
     symmetric = options.symmetric if options.symmetric is not None else _is_symmetric(surface)
     fit = _refine(fit, coarse, surface, symmetric, _in_frame(marks, frame, coarse.mesh.vertex_count))
-    _refuse_strangers(fit, coarse, surface)
+    _refuse_strangers(fit, coarse, surface, share=_NOT_HUMAN)
     fitted, _ = fine.evaluate(fit.pose)
-    filled = _filled(options.fill, fine.mesh)
     marks = _in_frame(marks, frame, fine.mesh.vertex_count)
     wrap = _lay_on(fitted, surface, coarse.mesh, fine.mesh, filled, marks, symmetric)
     notes = (
@@ -204,7 +208,7 @@ def _refine(fit: BodyFit, model: BodyModel, surface: Surface, symmetric: bool, m
     return fit
 
 
-def _refuse_strangers(fit: BodyFit, model: BodyModel, surface: Surface) -> None:
+def _refuse_strangers(fit: BodyFit, model: BodyModel, surface: Surface, *, share: float) -> None:
     stature = float(np.ptp(surface.vertices[:, 1]))
     there = surface.closest(fit.vertices[model.skin])
     here = Surface(fit.vertices, model.triangles).closest(surface.vertices)
@@ -212,11 +216,11 @@ def _refuse_strangers(fit: BodyFit, model: BodyModel, surface: Surface) -> None:
         float(np.linalg.norm(there.points - fit.vertices[model.skin], axis=1).mean()),
         float(np.linalg.norm(here.points - surface.vertices, axis=1).mean()),
     ]
-    if max(gaps) > _NOT_HUMAN * stature:
+    if max(gaps) > share * stature:
         raise InputError(
             "native mesh",
             got=f"a surface {1000 * max(gaps):.0f} mm from the nearest human body on average",
-            expected=f"at most {1000 * _NOT_HUMAN * stature:.0f} mm ({_NOT_HUMAN:.0%} of its height)",
+            expected=f"at most {1000 * share * stature:.0f} mm ({share:.0%} of its height)",
             fix="Pass one human body in a T- or A-pose; if it is one, say unit=, up= and forward=.",
         )
 

@@ -67,7 +67,7 @@ def run(config: DictConfig, output: Path) -> None:
         "symmetric": found.symmetric, "notes": list(found.notes), **quality.as_dict(),
     }  # fmt: skip
     text = json.dumps(report, indent=2) + "\n"
-    atomic_write(folder / "report.json", lambda path: path.write_text(text, encoding="utf-8") and None)
+    atomic_write(folder / "report.json", lambda path: _write_text(path, text))
     _say(found, quality, pair)
     if config.picture:
         from soma_core.tasks.wrap_picture import draw_wrap
@@ -210,7 +210,7 @@ def write_pair(
     native, wrap = folder / name, folder / WRAP_FILE
     if source is not None:
         if not (native.exists() and native.samefile(source)):
-            atomic_write(native, lambda path: shutil.copyfile(source, path) and None)
+            atomic_write(native, lambda path: _copy(source, path))
     else:
         atomic_write(native, lambda path: _write_obj(path, vertices, triangles + 1, digits + 2))
     faces = _canonical_faces(mesh)
@@ -234,4 +234,12 @@ def _write_obj(
     lines = [f"v {x:.{digits}f} {y:.{digits}f} {z:.{digits}f}" for x, y, z in vertices.tolist()]
     lines += [] if uv is None else [f"vt {u:.6f} {v:.6f}" for u, v in uv.tolist()]
     lines += ["f " + " ".join(map(str, face)) for face in faces]
-    path.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    _write_text(path, "\n".join(lines) + "\n")
+
+
+def _write_text(path: Path, text: str) -> None:
+    path.write_text(text, encoding="utf-8")
+
+
+def _copy(source: Path, path: Path) -> None:
+    shutil.copyfile(source, path)

@@ -1,0 +1,119 @@
+"""The canonical mesh on real bodies: near the artist's wrap, on the surface, few folds; strangers refused."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from soma_core.errors import InputError
+from soma_core.plugin.registry import default_registry
+from soma_core.registration.quality import Quality, measure
+from soma_core.registration.register import Registration, WrapOptions, register
+from soma_core.rig import load_canonical
+from soma_core.topology.wrap_pair import check_order, read_obj
+from tests.registration.test_target import sphere
+
+# Bounds of the acceptance of `soma wrap`; what is reached is several times better.
+ANNY_SURFACE_MM, MHR_SURFACE_MM = 0.1, 0.3
+BODY_MEDIAN_MM, BODY_P95_MM = 5.0, 15.0
+HAND_MEDIAN_MM, HAND_P95_MM = 5.0, 15.0
+FLIPPED_PERCENT = 0.1
+SIDES_MM = 0.01  # both sides of a symmetric body, where they were projected one by one
+
+TO_NATIVE = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
+"""+Y up, facing +Z to +Z up, facing -Y."""
+
+MHR = Path(os.environ.get("SOMA_TEST_DATA", "")) / "mhr" / "mhr_neutral_lod1.ply"
+
+
+@pytest.fixture(scope="module")
+def anny_pair() -> tuple[tuple[np.ndarray, np.ndarray], np.ndarray]:
+    """Anny's neutral mesh in centimetres, +Z up, and the artist's wrap in the same frame."""
+    registry = default_registry()
+    if "anny" not in registry.names():
+        pytest.skip("soma-backend-anny is not installed")
+    wrap = registry.spec("anny").wrap
+    assert wrap is not None
+    vertices, triangles = read_obj(wrap.native)
+    artist, _ = read_obj(wrap.wrap)
+    return (100 * vertices @ TO_NATIVE.T, triangles), 100 * artist @ TO_NATIVE.T
+
+
+@pytest.fixture(scope="module")
+def anny(anny_pair) -> Registration:
+    return register(*anny_pair[0])
+
+
+@pytest.fixture(scope="module")
+def anny_quality(anny: Registration) -> Quality:
+    return measure(anny, load_canonical("mid")[0])
+
+
+def test_unit_and_axes_are_found(anny: Registration) -> None:
+    assert (anny.frame.unit, anny.frame.up, anny.frame.forward) == ("cm", "+z", "-y")
+    assert anny.notes[0] == "unit cm, up +z, facing -y"
+    assert anny.symmetric
+
+
+def test_eyeballs_and_tongue_are_no_skin(anny: Registration) -> None:
+    assert anny.notes[-1] == "3 smaller parts of 226, 72, 72 vertices left out"
+
+
+def test_the_wrap_lies_on_the_surface(anny_quality: Quality) -> None:
+    numbers = anny_quality.as_dict()
+    assert numbers["surface_distance_mm"]["mean"] < ANNY_SURFACE_MM
+    assert numbers["flipped_percent"] < FLIPPED_PERCENT
+
+
+def test_vertices_are_where_the_artist_put_them(anny: Registration, anny_pair) -> None:
+    mesh, rig = load_canonical("mid")
+    moved_by = np.array(rig.joint_names)[rig.weights.toarray().argmax(1)]
+    hand = np.array(["Hand" in name for name in moved_by])
+    distance = 10 * np.linalg.norm(anny.wrap - anny_pair[1], axis=1)
+    body = distance[~hand & ~anny.filled]
+    assert np.median(body) < BODY_MEDIAN_MM
+    assert np.percentile(body, 95) < BODY_P95_MM
+    assert np.median(distance[hand]) < HAND_MEDIAN_MM
+    assert np.percentile(distance[hand], 95) < HAND_P95_MM
+    check_order(anny.wrap, mesh, path=Path("wrap"))
+
+
+def test_both_sides_are_alike(anny: Registration) -> None:
+    mesh, _ = load_canonical("mid")
+    wrap = anny.frame.to_canonical(anny.wrap)
+    difference = np.linalg.norm(wrap - wrap[mesh.mirror] * [-1, 1, 1], axis=1)
+    assert 1000 * np.median(difference) < SIDES_MM
+
+
+@pytest.mark.skipif(not MHR.is_file(), reason=f"needs SOMA_TEST_DATA with {MHR}")
+def test_a_body_that_our_shape_space_was_not_trained_on() -> None:
+    import trimesh
+
+    loaded = trimesh.load(MHR, process=False, maintain_order=True)
+    found = register(np.asarray(loaded.vertices, np.float64), np.asarray(loaded.faces))
+    assert (found.frame.unit, found.frame.up, found.frame.forward) == ("cm", "+y", "+z")
+    numbers = measure(found, load_canonical("mid")[0]).as_dict()
+    assert numbers["surface_distance_mm"]["mean"] < MHR_SURFACE_MM
+    assert numbers["native_to_wrap_mm"]["mean"] < 2 * MHR_SURFACE_MM
+
+
+def test_a_sphere_is_no_body() -> None:
+    with pytest.raises(InputError, match=r"got a surface \d+ mm from the nearest human body on average"):
+        register(*sphere(), options=WrapOptions(unit="m", up="+y", forward="+z"))
+
+
+def test_options_out_of_range_are_refused() -> None:
+    vertices, triangles = sphere()
+    with pytest.raises(
+        InputError, match="landmarks: got canonical vertex 99999, expected ids from 0 to 18055"
+    ):
+        register(vertices, triangles, options=WrapOptions(landmarks={99999: 0}))
+    with pytest.raises(InputError, match="landmarks: got native vertex -1"):
+        register(vertices, triangles, options=WrapOptions(landmarks={0: -1}))
+    with pytest.raises(InputError, match="fill: got noses, expected names among .*mouth_bag"):
+        register(vertices, triangles, options=WrapOptions(fill=("noses",)))
+    with pytest.raises(InputError, match=r"forward: got '-y', expected an axis across up='\+y'"):
+        register(vertices, triangles, options=WrapOptions(up="+y", forward="-y"))
