@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -25,10 +27,11 @@ class UsdSequence(VertexSequence):
     """
 
     def __init__(self, path: Path) -> None:
-        from pxr import UsdGeom
+        from pxr import Usd, UsdGeom
 
-        self._stage = _open_stage(path)
-        self._points, self._skin, times = _moving_mesh(path, self._stage)
+        with _usd_errors(path):
+            self._stage = Usd.Stage.Open(str(path))
+            self._points, self._skin, times = _moving_mesh(path, self._stage)
         self._times = times or [self._stage.GetStartTimeCode()]
         rate = self._stage.GetTimeCodesPerSecond()
         super().__init__(
@@ -41,7 +44,8 @@ class UsdSequence(VertexSequence):
         )
 
     def _read(self, start: int, stop: int) -> np.ndarray:
-        return np.stack([self._frame(time) for time in self._times[start:stop]])
+        with _usd_errors(self.path):
+            return np.stack([self._frame(time) for time in self._times[start:stop]])
 
     def _frame(self, time: float) -> np.ndarray:
         from pxr import UsdGeom
@@ -70,12 +74,12 @@ class UsdSequence(VertexSequence):
         self._skin = self._points = self._stage = None
 
 
-def _open_stage(path: Path) -> Any:
-    from pxr import Usd
-
+@contextmanager
+def _usd_errors(path: Path) -> Iterator[None]:
+    """Name the file where USD fails: pxr raises Tf.ErrorException, a RuntimeError with C++ source lines."""
     try:
-        return Usd.Stage.Open(str(path))
-    except RuntimeError as error:  # pxr raises Tf.ErrorException, a RuntimeError with C++ source lines
+        yield
+    except RuntimeError as error:
         raise AssetError(path, cause="not a readable USD file", fix="Export it again.") from error
 
 

@@ -67,10 +67,18 @@ def _open(path: Path) -> Usd.Stage:
     try:
         return Usd.Stage.Open(str(path))
     except Tf.ErrorException as error:
-        lines = [line.strip() for line in str(error).splitlines() if line.strip()]
-        cause = f"USD cannot read it ({lines[-1] if lines else 'no reason given'})"
+        cause = f"USD cannot read it ({_last_line(error)})"
         fix = "Restore the file; a text layer that ends early was truncated"
         raise AssetError(path, cause=cause, fix=fix) from error
+
+
+def _last_line(error: Exception) -> str:
+    """What USD says at last; its text cannot always be decoded."""
+    try:
+        lines = [line.strip() for line in str(error).splitlines() if line.strip()]
+    except UnicodeDecodeError:
+        lines = []
+    return lines[-1] if lines else "no reason given"
 
 
 def _columns(matrix: object) -> np.ndarray:
