@@ -127,7 +127,7 @@ def test_a_wrong_override_is_named_in_full(run: Run, override: str, text: str, t
 
 
 def test_a_backend_that_is_not_installed_is_reported_in_our_words(run: Run) -> None:
-    with pytest.raises(UnknownBackendError, match='"smplx".*Run: pip install soma-backend-smpl'):
-        run("backend=smplx")
-    with pytest.raises(UnknownBackendError, match='"smplx"'):
-        run("--multirun", "backend=soma,smplx")
+    with pytest.raises(UnknownBackendError, match='"mhr".*Run: pip install soma-backend-mhr'):
+        run("backend=mhr")
+    with pytest.raises(UnknownBackendError, match='"mhr"'):
+        run("--multirun", "backend=soma,mhr")
