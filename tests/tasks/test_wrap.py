@@ -1,0 +1,180 @@
+"""``soma wrap``: what it reads, what it writes and what it refuses; the registration itself is replaced."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from omegaconf import DictConfig, OmegaConf
+
+from soma_core.config.schema import WrapConfig
+from soma_core.errors import AssetError, InputError
+from soma_core.plugin.spec import WrapPair
+from soma_core.registration.register import Registration, WrapOptions
+from soma_core.registration.target import Frame, Skin
+from soma_core.rig import load_canonical
+from soma_core.rig.mesh import CanonicalMesh
+from soma_core.tasks import wrap
+from soma_core.topology.correspondence import load_correspondence
+from soma_core.topology.wrap_pair import read_obj
+
+ROUNDING_MM = 1e-3  # seven decimals of a metre
+FLIPPED_PERCENT = 0.1  # normals at sharp creases are no clear answer, not even for the mesh itself
+CENTRE = (0.0, 0.0, 0.0)
+
+
+def configured(**changes: object) -> DictConfig:
+    return OmegaConf.merge(OmegaConf.structured(WrapConfig), {"picture": False} | changes)
+
+
+@pytest.fixture(scope="module")
+def mesh() -> CanonicalMesh:
+    return load_canonical("mid")[0]
+
+
+@pytest.fixture
+def seen(monkeypatch: pytest.MonkeyPatch, mesh: CanonicalMesh) -> list[WrapOptions]:
+    """The registration finds the canonical mesh on itself; the options that it got."""
+    got: list[WrapOptions] = []
+
+    def found(vertices: np.ndarray, triangles: np.ndarray, *, options: WrapOptions) -> Registration:
+        got.append(options)
+        filled = np.zeros(mesh.vertex_count, bool)
+        filled[mesh.face_interior] = True
+        return Registration(
+            wrap=mesh.vertices.copy(),
+            frame=Frame(unit="m", up="+y", forward="+z", centre=CENTRE),
+            skin=Skin(vertices=vertices, triangles=triangles),
+            filled=filled,
+            symmetric=True,
+            fitted=mesh.vertices,
+            notes=("unit m, up +y, facing +z",),
+        )
+
+    monkeypatch.setattr(wrap, "register", found)
+    return got
+
+
+@pytest.fixture
+def body(tmp_path: Path, mesh: CanonicalMesh) -> Path:
+    path = tmp_path / "body.obj"
+    lines = [f"v {x} {y} {z}" for x, y, z in mesh.vertices.tolist()]
+    lines += [f"f {a} {b} {c}" for a, b, c in (mesh.triangles + 1).tolist()]
+    path.write_text("# made by hand\n" + "\n".join(lines) + "\n", encoding="utf-8")
+    return path
+
+
+def test_the_pair_is_ready_for_a_plugin(
+    tmp_path: Path, body: Path, mesh: CanonicalMesh, seen: list[WrapOptions]
+) -> None:
+    wrap.run(configured(native=str(body), out=str(tmp_path / "pair")), tmp_path / "run")
+    folder = tmp_path / "pair"
+    assert (folder / "body.obj").read_bytes() == body.read_bytes()
+    vertices, _ = read_obj(folder / wrap.WRAP_FILE)
+    assert 1000 * np.abs(vertices - mesh.vertices).max() < ROUNDING_MM
+    pair = WrapPair(native=folder / "body.obj", wrap=folder / wrap.WRAP_FILE)
+    found = load_correspondence(pair, mesh)
+    assert 1000 * found.distances.max() < ROUNDING_MM
+    report = json.loads((folder / "report.json").read_text(encoding="utf-8"))
+    assert report["surface_distance_mm"]["max"] < ROUNDING_MM
+    assert report["flipped_percent"] < FLIPPED_PERCENT
+    assert (report["unit"], report["up"], report["forward"]) == ("m", "+y", "+z")
+    assert report["filled_vertices"] == len(mesh.face_interior)
+
+
+def test_the_wrap_carries_the_uvs(tmp_path: Path, body: Path, mesh: CanonicalMesh, seen) -> None:
+    wrap.run(configured(native=str(body)), tmp_path)
+    lines = (tmp_path / wrap.WRAP_FILE).read_text(encoding="utf-8").splitlines()
+    assert sum(line.startswith("vt ") for line in lines) == len(mesh.uv)
+    faces = [line for line in lines if line.startswith("f ")]
+    assert len(faces) == len(mesh.face_vert_counts)
+    first = [f"{v + 1}/{t + 1}" for v, t in zip(mesh.face_vert_indices[:4], mesh.uv_indices[:4], strict=True)]
+    assert faces[0].split()[1:] == (first if len(mesh.uv) else [part.split("/")[0] for part in first])
+
+
+def test_a_ply_is_read_in_its_order(tmp_path: Path, mesh: CanonicalMesh, seen) -> None:
+    import trimesh
+
+    path = tmp_path / "scan.ply"
+    trimesh.Trimesh(mesh.vertices, mesh.triangles, process=False).export(path)
+    wrap.run(configured(native=str(path), out=str(tmp_path / "pair")), tmp_path)
+    vertices, triangles = read_obj(tmp_path / "pair" / "scan.obj")
+    assert 1000 * np.abs(vertices - mesh.vertices).max() < ROUNDING_MM
+    np.testing.assert_array_equal(triangles, mesh.triangles)
+
+
+def test_a_mesh_with_the_name_of_the_wrap_keeps_out_of_its_way(tmp_path: Path, body: Path, seen) -> None:
+    native = body.rename(tmp_path / wrap.WRAP_FILE)
+    wrap.run(configured(native=str(native), out=str(tmp_path / "pair")), tmp_path)
+    assert (tmp_path / "pair" / f"native_{wrap.WRAP_FILE}").read_bytes() == native.read_bytes()
+
+
+def test_what_the_user_knows_is_passed_on(tmp_path: Path, body: Path, seen: list[WrapOptions]) -> None:
+    (tmp_path / "marks.json").write_text('{"12": 34}', encoding="utf-8")
+    (tmp_path / "mask.json").write_text("[5, 6]", encoding="utf-8")
+    given = {"landmarks": str(tmp_path / "marks.json"), "mask": str(tmp_path / "mask.json")}
+    known = {"unit": "cm", "up": "+z", "forward": "-y", "symmetric": False, "fill": ["eye_bags"]}
+    wrap.run(configured(native=str(body), **given, **known), tmp_path)
+    (options,) = seen
+    assert options == WrapOptions(
+        unit="cm",
+        up="+z",
+        forward="-y",
+        symmetric=False,
+        fill=("eye_bags",),
+        landmarks={12: 34},
+        masked=[5, 6],
+    )
+
+
+@pytest.mark.parametrize(
+    ("changes", "error", "text"),
+    [
+        ({}, InputError, "native: got none, and no backend"),
+        ({"native": "a.obj", "backend": "anny"}, InputError, "native: got a mesh and a backend"),
+        ({"native": "a.fbx"}, InputError, "native: got the suffix '.fbx'"),
+        ({"native": "missing.obj"}, AssetError, "missing.obj"),
+        ({"backend": "soma"}, InputError, "backend: got soma, expected a backend with a topology of its own"),
+        ({"up": "up"}, InputError, "up: got 'up', expected"),
+        ({"mask": "missing.json"}, AssetError, "missing.json: cannot be read"),
+    ],
+)
+def test_what_cannot_be_used_is_refused(
+    changes: dict, error: type[Exception], text: str, tmp_path: Path, body: Path, seen
+) -> None:
+    if not {"native", "backend"} & set(changes):
+        changes = {**changes, **({"native": str(body)} if changes else {})}
+    with pytest.raises(error, match=text):
+        wrap.run(configured(**changes), tmp_path)
+
+
+@pytest.mark.parametrize("content", ["[1.5]", "{}", '["a"]', "not json", "[[1]]"])
+def test_a_mask_that_is_no_list_of_ids_is_refused(content: str, tmp_path: Path, body: Path, seen) -> None:
+    (tmp_path / "mask.json").write_text(content, encoding="utf-8")
+    with pytest.raises(AssetError, match="mask.json: does not hold a list of native vertex ids"):
+        wrap.run(configured(native=str(body), mask=str(tmp_path / "mask.json")), tmp_path)
+
+
+def test_a_ply_without_faces_is_refused(tmp_path: Path, seen) -> None:
+    path = tmp_path / "points.ply"
+    path.write_text(
+        "ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nproperty float y\nproperty float z\n"
+        "end_header\n0 0 0\n",
+        encoding="utf-8",
+    )
+    with pytest.raises(AssetError, match="points.ply: holds no faces"):
+        wrap.run(configured(native=str(path)), tmp_path)
+
+
+def test_the_picture_is_drawn(tmp_path: Path, body: Path, seen) -> None:
+    pytest.importorskip("pyvista")
+    from PIL import Image
+
+    wrap.run(configured(native=str(body), picture=True), tmp_path)
+    with Image.open(tmp_path / "wrap.png") as picture:
+        pixels = np.asarray(picture)
+    assert pixels.shape[1] == 4 * 430
+    for column in range(4):  # no cell is empty
+        assert pixels[50:600, 430 * column : 430 * (column + 1)].std() > 5
