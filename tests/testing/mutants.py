@@ -212,7 +212,7 @@ MUTANTS = (
         "options.strength: got 2.0, expected 1.0",
         _in(_CONFIG, "strength: 1.0", "strength: 2.0"),
     ),
-    Mutant("wrap-reads", "wrap.obj: got cannot be read", lambda made: made.delete("wrap.obj")),
+    Mutant("wrap-reads", "wrap.obj: got file is missing", lambda made: made.delete("wrap.obj")),
     Mutant("wrap-reads", "got line 1 is v 1 2", lambda made: made.prepend("wrap.obj", "v 1 2\n")),
     Mutant(
         "wrap-count",
