@@ -148,10 +148,12 @@ class Registry:
         device: torch.device,
         dtype: torch.dtype,
         options: Mapping[str, Any] | None = None,
+        wrapped: bool = True,
     ) -> Generator:
         """Build the native generator of backend `name`; options are checked against its declaration.
 
-        A failed build is tried again on the next call: the user may have supplied the missing file.
+        Without `wrapped` its wrap pair may be missing: a pair is made from the neutral mesh. A failed build
+        is tried again on the next call: the user may have supplied the missing file.
 
         Raises:
             InputError: an option that the backend does not know or refuses.
@@ -159,7 +161,7 @@ class Registry:
         """
         spec = self.spec(name)
         record = self._records[name]
-        self._check_files(record, spec)
+        self._check_files(record, spec, wrapped=wrapped)
         assert record.manager is not None
         with _isolated(record, "build"):
             checked = checked_options(spec, options or {})
@@ -290,14 +292,17 @@ class Registry:
             fix = f"Run: {reinstall_command(record.offers[0].distribution)}"
             warnings.warn(f"{record.who}: spec: {_spoken(spec)}. {fix}", BackendWarning, stacklevel=3)
 
-    def _check_files(self, record: _Record, spec: BackendSpec) -> None:
+    def _check_files(self, record: _Record, spec: BackendSpec, *, wrapped: bool) -> None:
+        pair = (spec.wrap.native, spec.wrap.wrap) if spec.wrap else ()
         for needed in spec.files:
+            if needed.path in pair and not wrapped:
+                continue
             with _isolated(record, "files"):
                 if not needed.path.exists():
                     raise PluginError(
                         f"{needed.description or 'a file'} is missing at {needed.path}", fix=_supply(needed)
                     )
-        for path in (spec.wrap.native, spec.wrap.wrap) if spec.wrap else ():
+        for path in pair if wrapped else ():
             with _isolated(record, "wrap"):
                 if not path.is_file():
                     raise PluginError(f"the wrap pair names {path}, which does not exist")

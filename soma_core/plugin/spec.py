@@ -19,6 +19,7 @@ __all__ = [
     "Generator",
     "HasLinearBasis",
     "HasPosed",
+    "HasTriangles",
     "LinearBasis",
     "Parameter",
     "Unit",
@@ -164,4 +165,13 @@ class HasPosed(Protocol):
 
     def posed(self, params: Mapping[str, Tensor], pose: Any) -> Tensor:
         """Posed vertices (batch, n, 3) in the native unit, topology and axes."""
+        ...
+
+
+@runtime_checkable
+class HasTriangles(Protocol):
+    """Optional capability: ``soma wrap backend=NAME`` works before the backend has any OBJ file."""
+
+    def triangles(self) -> Tensor:
+        """Native vertex ids (t, 3), counter-clockwise seen from outside."""
         ...

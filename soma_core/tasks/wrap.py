@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import logging
 import shutil
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -17,7 +17,7 @@ from soma_core.cache import atomic_write
 from soma_core.errors import AssetError, InputError
 from soma_core.io.mesh_vertices import read_mesh_vertices
 from soma_core.plugin.registry import default_registry
-from soma_core.plugin.spec import WrapPair
+from soma_core.plugin.spec import HasTriangles, WrapPair
 from soma_core.registration.quality import Quality, measure
 from soma_core.registration.register import Registration, WrapOptions, register
 from soma_core.rig import load_canonical
@@ -68,14 +68,14 @@ def run(config: DictConfig, output: Path) -> None:
     }  # fmt: skip
     text = json.dumps(report, indent=2) + "\n"
     atomic_write(folder / "report.json", lambda path: _write_text(path, text))
-    _say(found, quality, pair)
+    _say(found, quality, pair, config.fill)
     if config.picture:
         from soma_core.tasks.wrap_picture import draw_wrap
 
         draw_wrap(folder / "wrap.png", found, quality, mesh)
 
 
-def _say(found: Registration, quality: Quality, pair: WrapPair) -> None:
+def _say(found: Registration, quality: Quality, pair: WrapPair, fill: Sequence[str]) -> None:
     numbers = quality.as_dict()
     for note in found.notes:
         _log.info("found: %s", note)
@@ -91,8 +91,8 @@ def _say(found: Registration, quality: Quality, pair: WrapPair) -> None:
     frame = found.frame
     _log.info(
         'for the declaration: wrap=WrapPair(native=folder / "%s", wrap=folder / "%s"), unit="%s", up="%s", '
-        'forward="%s"',
-        pair.native.name, pair.wrap.name, frame.unit, frame.up, frame.forward,
+        'forward="%s", fill_segments=%s',
+        pair.native.name, pair.wrap.name, frame.unit, frame.up, frame.forward, tuple(fill),
     )  # fmt: skip
 
 
@@ -134,11 +134,22 @@ def _neutral(name: str) -> _Native:
         raise InputError(
             "backend", got=name, expected="a backend with a topology of its own", fix="It needs no wrap."
         )
-    generator = registry.generator(name, device=torch.device("cpu"), dtype=torch.float64, options={})
+    cpu = torch.device("cpu")
+    generator = registry.generator(name, device=cpu, dtype=torch.float64, wrapped=False)
     params = {p.name: torch.full((1, *p.shape), p.default, dtype=torch.float64) for p in spec.params}
-    with torch.no_grad():
-        vertices = generator.rest(params)[0].numpy().astype(np.float64)
-    _, triangles = read_obj(spec.wrap.native)
+    with registry.isolated(name, "rest"), torch.no_grad():
+        vertices = generator.rest(params)[0].double().numpy()
+    if isinstance(generator, HasTriangles):
+        triangles = generator.triangles().numpy()
+    elif spec.wrap.native.is_file():
+        triangles = read_obj(spec.wrap.native)[1]
+    else:
+        raise InputError(
+            "backend",
+            got=f"{name}, whose generator has no triangles(), and no file {spec.wrap.native}",
+            expected="one of the two, for the faces",
+            fix="Write the neutral mesh as OBJ and pass native=FILE.",
+        )
     return _Native(
         vertices=vertices, triangles=triangles, name=f"{name}_neutral.obj",
         known={"unit": spec.unit, "up": spec.up, "forward": spec.forward},

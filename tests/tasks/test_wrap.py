@@ -7,11 +7,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from omegaconf import DictConfig, OmegaConf
 
 from soma_core.config.schema import WrapConfig
 from soma_core.errors import AssetError, InputError
-from soma_core.plugin.spec import WrapPair
+from soma_core.plugin.hookspecs import hookimpl
+from soma_core.plugin.registry import Registry
+from soma_core.plugin.spec import Parameter, WrapPair
 from soma_core.registration.register import Registration, WrapOptions
 from soma_core.registration.target import Frame, Skin
 from soma_core.rig import load_canonical
@@ -19,6 +22,7 @@ from soma_core.rig.mesh import CanonicalMesh
 from soma_core.tasks import wrap
 from soma_core.topology.correspondence import load_correspondence
 from soma_core.topology.wrap_pair import read_obj
+from tests.plugin.fakes import FakeEntryPoint, declares
 
 ROUNDING_MM = 1e-3  # seven decimals of a metre
 FLIPPED_PERCENT = 0.1  # normals at sharp creases are no clear answer, not even for the mesh itself
@@ -127,6 +131,44 @@ def test_what_the_user_knows_is_passed_on(tmp_path: Path, body: Path, seen: list
         landmarks={12: 34},
         masked=[5, 6],
     )
+
+
+class _Neutral:
+    """A model of the canonical mesh in centimetres."""
+
+    def rest(self, params):
+        scale = 1 + 0 * params["size"][:, None, None]
+        return 100 * scale * torch.tensor(load_canonical("mid")[0].vertices)[None]
+
+
+class _WithFaces(_Neutral):
+    def triangles(self):
+        return torch.tensor(load_canonical("mid")[0].triangles)
+
+
+def _registry(tmp_path: Path, generator: object) -> Registry:
+    """One backend, "good", whose wrap pair is missing."""
+    pair = WrapPair(native=tmp_path / "nowhere" / "native.obj", wrap=tmp_path / "nowhere" / "wrap.obj")
+    plugin = declares(wrap=pair, unit="cm", params=(Parameter(name="size"),))
+    plugin.soma_generator = hookimpl(lambda: generator)
+    return Registry([FakeEntryPoint("good", plugin)])
+
+
+def test_a_backend_without_a_pair_is_wrapped_from_its_generator(
+    tmp_path: Path, mesh: CanonicalMesh, seen: list[WrapOptions], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(wrap, "default_registry", lambda: _registry(tmp_path, _WithFaces()))
+    wrap.run(configured(backend="good", out=str(tmp_path / "pair")), tmp_path)
+    vertices, triangles = read_obj(tmp_path / "pair" / "good_neutral.obj")
+    assert 1000 * np.abs(vertices / 100 - mesh.vertices).max() < ROUNDING_MM
+    np.testing.assert_array_equal(triangles, mesh.triangles)
+    assert seen[0].unit == "cm"
+
+
+def test_a_backend_without_faces_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, seen) -> None:
+    monkeypatch.setattr(wrap, "default_registry", lambda: _registry(tmp_path, _Neutral()))
+    with pytest.raises(InputError, match=r"backend: got good, whose generator has no triangles\(\)"):
+        wrap.run(configured(backend="good"), tmp_path)
 
 
 @pytest.mark.parametrize(
