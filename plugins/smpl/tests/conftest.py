@@ -24,17 +24,24 @@ def official(tmp_path_factory) -> Path:
 
 
 @pytest.fixture(scope="session")
-def data_folder(official, tmp_path_factory):
-    """SOMA_DATA_DIR for the whole session: the converted models and their wraps."""
+def supplied(official, tmp_path_factory) -> Path:
+    """The converted models and their wraps."""
     root = tmp_path_factory.mktemp("data")
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("SOMA_DATA_DIR", str(root))
-        patch.setenv("SOMA_CACHE_DIR", str(tmp_path_factory.mktemp("cache")))
         for name in ("basicmodel_neutral_lbs_10_207_0_v1.1.0.pkl", "basicModel_m_lbs_10_207_0_v1.0.0.pkl"):
             smpl.soma_convert(official / name, None)
         for gender in ("male", "neutral"):
             smplh.soma_convert(official / "smplh" / gender / "model.npz", None)
         smplx.soma_convert(official / "SMPLX_NEUTRAL.npz", None)
-        write_smpl_wrap(root, "smpl")
-        write_smpl_wrap(root, "smplx")
-        yield root
+    write_smpl_wrap(root, "smpl")
+    write_smpl_wrap(root, "smplx")
+    return root
+
+
+@pytest.fixture
+def data_folder(supplied, tmp_path, monkeypatch) -> Path:
+    """SOMA_DATA_DIR with the models, and a cache of its own."""
+    monkeypatch.setenv("SOMA_DATA_DIR", str(supplied))
+    monkeypatch.setenv("SOMA_CACHE_DIR", str(tmp_path / "cache"))
+    return supplied
