@@ -3,6 +3,7 @@
 from soma_core.inversion.analytical import AnalyticalOptions
 from soma_core.inversion.autograd import AutogradOptions
 from soma_core.inversion.fit import PoseInversion
+from soma_core.inversion.identity import IdentityFit, fit_identity
 from soma_core.inversion.priors import HINGES, PosePriors
 from soma_core.inversion.result import InversionResult
 
@@ -10,7 +11,9 @@ __all__ = [
     "HINGES",
     "AnalyticalOptions",
     "AutogradOptions",
+    "IdentityFit",
     "InversionResult",
     "PoseInversion",
     "PosePriors",
+    "fit_identity",
 ]

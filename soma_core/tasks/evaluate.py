@@ -18,7 +18,8 @@ __all__ = ["EXPERIMENTS", "run"]
 _log = logging.getLogger(__name__)
 
 EXPERIMENTS = (
-    "table1_topology", "table2_inversion", "table3_regions", "forward_path", "anny_reference",
+    "table1_topology", "table2_inversion", "table3_regions", "unknown_identity", "forward_path",
+    "anny_reference",
 )  # fmt: skip
 """Modules of ``soma_core.evaluation`` with a function ``run(config) -> Report``."""
 

@@ -1,0 +1,213 @@
+"""Parameters of a backend from posed meshes, the poses eliminated."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import scipy.optimize
+import torch
+from torch import Tensor
+
+from soma_core.inversion.fit import PoseInversion
+from soma_core.inversion.free_parameters import FreeParameters
+from soma_core.inversion.result import InversionResult
+from soma_core.inversion.shape_response import shape_normal_equations
+from soma_core.skeleton.identity import Identity
+
+__all__ = ["Sample", "ShapeFound", "search_parameters"]
+
+_PLAIN, _ROBUST = 1.0, 5e-4
+"""Scale of the loss [m]: vertices whose error lies above it count less. The first leaves all alike."""
+
+_CANDIDATES, _STARTS = 48, 4
+_FEW_FRAMES, _FEW_STEPS = 4, 6
+"""Bodies looked at, and those of them followed a few steps on a few frames; the best one goes on."""
+
+_AT_A_TIME = 8
+"""Candidates fitted at a time, to bound memory."""
+
+_STEP = 0.1
+"""Length of the steps that derivatives are taken over, in units of the parameters."""
+
+_PRIOR = 1e-5
+"""Weight of a parameter's square, relative to the mean squared error: decides what the frames do not."""
+
+_LOWER, _RAISE, _TRIES = 0.2, 8.0, 5
+"""Levenberg damping: factors after a good and a bad step; bad steps in a row before the search ends."""
+
+_NOTICEABLE = 3e-4
+"""A step that lowers the error by less, relatively, is the last."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Sample:
+    """The frames that an identity is estimated from.
+
+    Attributes:
+        vertices: (F, v, 3) [m], canonical.
+        weights: (1 or F, v).
+    """
+
+    vertices: Tensor
+    weights: Tensor
+
+    def without_gaps(self) -> Sample:
+        """The same with zeros where a vertex has no weight."""
+        return replace(self, vertices=torch.where(self.weights[..., None] > 0, self.vertices, 0.0))
+
+    def some(self, count: int) -> Sample:
+        """Up to `count` frames, evenly spread."""
+        index = torch.linspace(0, len(self.vertices) - 1, min(count, len(self.vertices))).round().long()
+        weights = self.weights[index] if len(self.weights) > 1 else self.weights
+        return Sample(vertices=self.vertices[index], weights=weights)
+
+    def squares(self, pose: InversionResult) -> Tensor:
+        """Mean squared error (v,) [m^2] of each vertex over the frames; infinite where a frame fails."""
+        weights = self.weights.expand(len(self.vertices), -1).double()
+        error = torch.where(weights > 0, pose.vertex_error.double(), 0.0).nan_to_num(nan=torch.inf)
+        return (weights * error.square()).sum(0) / weights.sum(0).clamp_min(1e-12)
+
+    def error(self, pose: InversionResult) -> float:
+        """Root mean square error [m]."""
+        return float(self.mean(self.squares(pose)).sqrt())
+
+    def mean(self, values: Tensor) -> Tensor:
+        """Mean over vertices of (v,) values, by weight."""
+        total = self.weights.double().mean(0)
+        return (values * total).sum() / total.sum()
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class ShapeFound:
+    """What a search found.
+
+    Attributes:
+        identity: batch of 1.
+        history: root mean square error [m] at the start, and after each accepted step.
+        converged: whether it ended before its steps did.
+    """
+
+    identity: Identity
+    history: tuple[float, ...]
+    converged: bool
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _State:
+    """A body under way: its parameters, pose, and squared errors (v,) [m^2]."""
+
+    point: np.ndarray
+    identity: Identity
+    pose: InversionResult
+    squares: Tensor
+
+
+def search_parameters(
+    inversion: PoseInversion, sample: Sample, parameters: FreeParameters, *, iterations: int
+) -> ShapeFound:
+    """Minimise the error over the parameters, every frame in its best pose.
+
+    A first descent takes all vertices alike. Where two models bend their skin differently, that error is
+    no fault of the shape, and a second descent lets vertices count by how well they are explained.
+    """
+    few = _Search(inversion, sample.some(_FEW_FRAMES), parameters)
+    found = [few.descend(point, _PLAIN, min(iterations, _FEW_STEPS))[0] for point in few.starts()]
+    best = min(found, key=lambda state: float(few.sample.mean(state.squares)))
+    whole = _Search(inversion, sample, parameters)
+    state, _ = whole.descend(best.point, _PLAIN, iterations)
+    state, converged = whole.descend(state.point, _ROBUST, iterations)
+    return ShapeFound(identity=state.identity, history=tuple(whole.history), converged=converged)
+
+
+class _Search:
+    """Levenberg-Marquardt over parameters on some frames; `history` grows with every accepted step."""
+
+    def __init__(self, inversion: PoseInversion, sample: Sample, parameters: FreeParameters) -> None:
+        self.inversion, self.sample, self.parameters = inversion, sample, parameters
+        self.history: list[float] = []
+
+    def starts(self) -> list[np.ndarray]:
+        """The given start, and the best of bodies spread over the bounded parameters."""
+        spread = self.parameters.spread(_CANDIDATES)
+        errors = [self._errors(spread[k : k + _AT_A_TIME]) for k in range(0, len(spread), _AT_A_TIME)]
+        order = np.argsort(np.concatenate(errors)) if errors else []
+        return [self.parameters.start, *(spread[index] for index in order[: _STARTS - 1])]
+
+    def _errors(self, points: np.ndarray) -> np.ndarray:
+        """Mean squared errors (m,) of several bodies, each in its best pose."""
+        count = len(self.sample.vertices)
+        bodies = self.parameters.identities(np.repeat(points, count, 0))
+        vertices = self.sample.vertices.repeat(len(points), 1, 1)
+        weights = self.sample.weights
+        weights = weights.repeat(len(points), 1) if len(weights) > 1 else weights
+        residual = self.inversion(vertices, bodies, weights=weights).residual.double()
+        squares = residual.square().nan_to_num(nan=torch.inf).view(len(points), count)
+        return squares.mean(1).cpu().numpy()
+
+    def descend(self, point: np.ndarray, scale: float, iterations: int) -> tuple[_State, bool]:
+        """Lower the error from `point`; the second value is whether it came to rest."""
+        trust = torch.ones_like(self.sample.weights[0])
+        state = self._state(point, trust)
+        self._note(state)
+        damping = 1e-3
+        for _ in range(iterations):
+            trust = (scale**2 / (scale**2 + state.squares)).to(trust)
+            prior = _PRIOR * float(self._loss(state, scale))
+            matrix, slope = self._normal_equations(state, trust, prior)
+            before = self._objective(state, scale, prior)
+            for _ in range(_TRIES):
+                trial = self._state(self._stepped(state.point, matrix, slope, damping), trust)
+                gain = before - self._objective(trial, scale, prior)
+                if gain > 0:
+                    break
+                damping *= _RAISE
+            else:
+                return state, True
+            damping *= _LOWER
+            state = trial
+            self._note(state)
+            if gain < _NOTICEABLE * before:
+                return state, True
+        return state, False
+
+    def _note(self, state: _State) -> None:
+        self.history.append(float(self.sample.mean(state.squares).sqrt()))
+
+    def _state(self, point: np.ndarray, trust: Tensor) -> _State:
+        identity = self.parameters.identities(point[None])
+        pose = self.inversion(self.sample.vertices, identity, weights=self.sample.weights * trust)
+        return _State(point=point, identity=identity, pose=pose, squares=self.sample.squares(pose))
+
+    def _loss(self, state: _State, scale: float) -> Tensor:
+        """Mean of ``s^2 log(1 + e^2 / s^2)`` over vertices [m^2]: e^2 for errors below the scale."""
+        return self.sample.mean(scale**2 * torch.log1p(state.squares / scale**2))
+
+    def _objective(self, state: _State, scale: float, prior: float) -> float:
+        return float(self._loss(state, scale)) + prior * float((state.point**2).sum())
+
+    def _normal_equations(self, state: _State, trust: Tensor, prior: float) -> tuple[np.ndarray, np.ndarray]:
+        steps = self.parameters.inward(state.point, _STEP)
+        points = state.point + np.concatenate((np.zeros((1, len(steps))), np.diag(steps)))
+        matrix, slope = shape_normal_equations(
+            self.inversion,
+            self.sample.vertices,
+            self.sample.weights * trust,
+            state.pose,
+            self.parameters.identities(points),
+            torch.as_tensor(steps, device=trust.device),
+        )
+        total = float(self.sample.weights.expand(len(self.sample.vertices), -1).double().sum())
+        matrix, slope = matrix.cpu().numpy() / total, slope.cpu().numpy() / total
+        return matrix + prior * np.eye(len(slope)), slope + prior * state.point
+
+    def _stepped(
+        self, point: np.ndarray, matrix: np.ndarray, slope: np.ndarray, damping: float
+    ) -> np.ndarray:
+        """The minimum of the damped quadratic inside the bounds."""
+        damped = matrix + damping * np.diag(np.diag(matrix))
+        factor = np.linalg.cholesky(damped)
+        goal = scipy.linalg.solve_triangular(factor, -slope, lower=True)
+        bounds = self.parameters.lower - point, self.parameters.upper - point
+        found = scipy.optimize.lsq_linear(factor.T, goal, bounds, method="bvls")
+        return point + found.x
