@@ -27,6 +27,8 @@ _SUPPLE = 0.1
 _ENDS = re.compile("Hand[A-Z]|Foot|Toe")
 """Joints of fingers and feet, which wait until limbs are in place."""
 
+_HANDS_AND_FEET = re.compile("Hand|Foot|Toe")
+
 _MIRROR = np.array([-1.0, 1.0, 1.0])
 
 
@@ -105,6 +107,14 @@ class BodyModel:
             hips=pose.hips * (_MIRROR + 1) / 2,
         )
 
+    def ends_like(self, pose: BodyPose, side: str) -> BodyPose:
+        """The same body, hands and feet turned as those of the `side`: the others may sit wrongly."""
+        names = self.layer.joint_names
+        other = _other_side(side)
+        copied = np.array([name.startswith(other) and bool(_HANDS_AND_FEET.search(name)) for name in names])
+        turned = _MIRROR[:, None] * pose.rotations[self.partner] * _MIRROR
+        return replace(pose, rotations=np.where(copied[:, None, None], turned, pose.rotations))
+
     @torch.no_grad()
     def evaluate(self, pose: BodyPose) -> tuple[np.ndarray, np.ndarray]:
         """Vertices (v, 3) and user joints (J - 1, 3), [m]."""
@@ -140,6 +150,7 @@ class BodyModel:
         for joint, turn in zip(self.joints, turns, strict=True):
             above = world[self.parents[joint]] if joint else np.eye(3)
             rotations[joint] = above.T @ Rotation.from_rotvec(turn).as_matrix() @ above @ rotations[joint]
+        rotations = Rotation.from_matrix(rotations).as_matrix()  # or rounding would grow from step to step
         return BodyPose(shape=pose.shape + step[3 * count + 3 :], rotations=rotations, hips=pose.hips + hips)
 
 

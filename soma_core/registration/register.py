@@ -37,6 +37,9 @@ _ROUGH = [0.2] * 4 + [0.1] * 3
 _STAGES = (([0.1] * 6, 20.0), ([0.05] * 6, 20.0), ([0.03] * 6, 8.0), ([0.02] * 6, 4.0), ([0.02] * 6, 2.0))
 """Scale [m] of each step of a stage, and how stiff fingers and feet are in it."""
 
+_TRIAL = 2
+"""Steps after which hands and feet taken from the other side are compared."""
+
 _COARSE = (8.0, 8.0, 6.0, 6.0, 4.0, 4.0, 3.0, 3.0, 2.0, 2.0)
 _FINE = (6.0, 6.0, 4.0, 4.0, 3.0, 3.0, 2.0, 2.0, 1.5, 1.5)
 """Lengths, in edges of the low and of the mid LOD, over which displacements are smooth."""
@@ -197,15 +200,24 @@ def _refine(fit: BodyFit, model: BodyModel, surface: Surface, symmetric: bool, m
     """Fit in stages, from coarse to fine; of a symmetric body the better side is kept."""
     for scales, ends in progress(_STAGES, label="fitting shape and pose", total=len(_STAGES)):
         fit = fit_body(model, surface, fit.pose, scales=scales, ends=ends, landmarks=marks)
-        if symmetric:
-            sides = [
-                fit_body(model, surface, model.like(fit.pose, side), scales=scales[-1:], ends=ends)
-                for side in ("Left", "Right")
-            ]
-            poses = [model.like(fit.pose, side) for side in ("Left", "Right")]
-            best = int(sides[1].cost < sides[0].cost)
-            fit = BodyFit(pose=poses[best], vertices=model.evaluate(poses[best])[0], cost=sides[best].cost)
+        fit = _better_side(fit, model, surface, symmetric, scale=scales[-1], ends=ends)
     return fit
+
+
+def _better_side(
+    fit: BodyFit, model: BodyModel, surface: Surface, symmetric: bool, *, scale: float, ends: float
+) -> BodyFit:
+    """Fingers and toes that took the wrong place on one side are tried as they are on the other.
+
+    A symmetric body becomes one like its better side; another may keep both as they are.
+    """
+    tried = [(model.like if symmetric else model.ends_like)(fit.pose, side) for side in ("Left", "Right")]
+    poses = tried if symmetric else [fit.pose, *tried]
+    steps = [fit_body(model, surface, pose, scales=[scale] * _TRIAL, ends=ends) for pose in poses]
+    best = min(range(len(poses)), key=lambda i: steps[i].cost)
+    if symmetric:
+        return BodyFit(pose=poses[best], vertices=model.evaluate(poses[best])[0], cost=steps[best].cost)
+    return steps[best]
 
 
 def _refuse_strangers(fit: BodyFit, model: BodyModel, surface: Surface, *, share: float) -> None:

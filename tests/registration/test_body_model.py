@@ -10,6 +10,7 @@ from soma_core.registration.body_fit import fit_body
 from soma_core.registration.body_model import BodyModel
 from soma_core.registration.surface import Surface
 
+ORTHONORMAL = 1e-9
 STEP_MM = 0.05  # second order of a step of 0.01 rad on a lever of a metre
 SIDES_MM = 1.5  # the rig's two sides are mirror images only to a millimetre
 SETTLED_MM = 5.0  # after the seven steps of the rough fit, from 140 mm away
@@ -64,3 +65,27 @@ def test_a_fit_finds_its_own_body_again(model: BodyModel) -> None:
     found = fit_body(model, surface, begin, scales=[0.2] * 4 + [0.1] * 3, ends=20.0)
     gap = np.linalg.norm(found.vertices - vertices, axis=1)[model.skin]
     assert 1000 * np.median(gap) < SETTLED_MM
+
+
+def test_rotations_stay_rotations_over_many_steps(model: BodyModel) -> None:
+    random = np.random.default_rng(3)
+    pose = model.start(0.5)
+    for _ in range(60):
+        step = 0.3 * random.standard_normal(3 * len(model.joints) + 3 + model.count)
+        pose = model.moved_by(pose, step)
+    gram = pose.rotations @ pose.rotations.transpose(0, 2, 1)
+    assert np.abs(gram - np.eye(3)).max() < ORTHONORMAL
+
+
+def test_hands_and_feet_can_be_taken_from_the_other_side(model: BodyModel) -> None:
+    step = np.zeros(3 * len(model.joints) + 3 + model.count)
+    step[: 3 * len(model.joints)] = 0.1 * np.random.default_rng(0).standard_normal(3 * len(model.joints))
+    pose = model.moved_by(model.start(0.5), step)
+    taken = model.ends_like(pose, "Left")
+    names = model.layer.joint_names
+    left, right, arm = (names.index(f"{name}") for name in ("LeftHandIndex2", "RightHandIndex2", "RightArm"))
+    mirror = np.diag([-1.0, 1, 1])
+    np.testing.assert_allclose(
+        taken.rotations[right], mirror @ pose.rotations[left] @ mirror, atol=ORTHONORMAL
+    )
+    np.testing.assert_array_equal(taken.rotations[[left, arm]], pose.rotations[[left, arm]])
