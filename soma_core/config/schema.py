@@ -263,8 +263,8 @@ class BenchConfig:
 class WrapConfig:
     """Configuration of ``soma wrap``."""
 
+    backend: BackendChoice = field(default_factory=BackendChoice)
     native: str | None = None
-    backend: str | None = None
     out: str | None = None
     unit: LengthUnit | None = None
     up: str | None = None

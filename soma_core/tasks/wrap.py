@@ -12,7 +12,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
+from omegaconf import OmegaConf
 
+from soma_core.backends.parameters import batch_parameters
 from soma_core.cache import atomic_write
 from soma_core.errors import AssetError, InputError
 from soma_core.io.mesh_vertices import read_mesh_vertices
@@ -22,6 +24,7 @@ from soma_core.registration.quality import Quality, measure
 from soma_core.registration.register import Registration, WrapOptions, register
 from soma_core.rig import load_canonical
 from soma_core.rig.mesh import CanonicalMesh
+from soma_core.tasks.animate import given_params
 from soma_core.topology.wrap_pair import read_obj
 
 if TYPE_CHECKING:
@@ -97,14 +100,15 @@ def _say(found: Registration, quality: Quality, pair: WrapPair, fill: Sequence[s
 
 
 def _read_native(config: DictConfig) -> _Native:
-    if (config.native is None) == (config.backend is None):
+    chosen = not OmegaConf.is_missing(config.backend, "name")
+    if chosen == (config.native is not None):
         raise InputError(
             "native",
-            got="none, and no backend" if config.native is None else "a mesh and a backend",
+            got="a mesh and a backend" if chosen else "none, and no backend",
             expected="one of the two",
             fix="Pass native=BODY.obj or backend=NAME.",
         )
-    if config.backend is not None:
+    if chosen:
         return _neutral(config.backend)
     path = Path(config.native).expanduser()
     if path.suffix.lower() == ".obj":
@@ -126,17 +130,18 @@ def _ply_triangles(path: Path, vertices: np.ndarray) -> np.ndarray:
     return np.asarray(loaded.faces, np.int64)
 
 
-def _neutral(name: str) -> _Native:
-    """The mesh of all default parameters, with the faces of the native mesh that the backend declares."""
-    registry = default_registry()
+def _neutral(choice: DictConfig) -> _Native:
+    """The mesh that a backend makes of its parameters, with the faces of the native mesh that it declares."""
+    registry, name = default_registry(), choice.name
     spec = registry.spec(name)
     if spec.wrap is None:
         raise InputError(
             "backend", got=name, expected="a backend with a topology of its own", fix="It needs no wrap."
         )
-    cpu = torch.device("cpu")
-    generator = registry.generator(name, device=cpu, dtype=torch.float64, wrapped=False)
-    params = {p.name: torch.full((1, *p.shape), p.default, dtype=torch.float64) for p in spec.params}
+    cpu, dtype = torch.device("cpu"), torch.float64
+    options = given_params(choice.options)
+    generator = registry.generator(name, device=cpu, dtype=dtype, options=options, wrapped=False)
+    params = batch_parameters(spec, given_params(choice.params), device=cpu, dtype=dtype)
     with registry.isolated(name, "rest"), torch.no_grad():
         vertices = generator.rest(params)[0].double().numpy()
     if isinstance(generator, HasTriangles):

@@ -10,6 +10,7 @@ import pytest
 import torch
 from omegaconf import DictConfig, OmegaConf
 
+from soma_core.cli import EXIT_USAGE, main
 from soma_core.config.schema import WrapConfig
 from soma_core.errors import AssetError, InputError
 from soma_core.plugin.hookspecs import hookimpl
@@ -158,7 +159,7 @@ def test_a_backend_without_a_pair_is_wrapped_from_its_generator(
     tmp_path: Path, mesh: CanonicalMesh, seen: list[WrapOptions], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(wrap, "default_registry", lambda: _registry(tmp_path, _WithFaces()))
-    wrap.run(configured(backend="good", out=str(tmp_path / "pair")), tmp_path)
+    wrap.run(configured(backend={"name": "good"}, out=str(tmp_path / "pair")), tmp_path)
     vertices, triangles = read_obj(tmp_path / "pair" / "good_neutral.obj")
     assert 1000 * np.abs(vertices / 100 - mesh.vertices).max() < ROUNDING_MM
     np.testing.assert_array_equal(triangles, mesh.triangles)
@@ -168,17 +169,21 @@ def test_a_backend_without_a_pair_is_wrapped_from_its_generator(
 def test_a_backend_without_faces_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, seen) -> None:
     monkeypatch.setattr(wrap, "default_registry", lambda: _registry(tmp_path, _Neutral()))
     with pytest.raises(InputError, match=r"backend: got good, whose generator has no triangles\(\)"):
-        wrap.run(configured(backend="good"), tmp_path)
+        wrap.run(configured(backend={"name": "good"}), tmp_path)
 
 
 @pytest.mark.parametrize(
     ("changes", "error", "text"),
     [
         ({}, InputError, "native: got none, and no backend"),
-        ({"native": "a.obj", "backend": "anny"}, InputError, "native: got a mesh and a backend"),
+        ({"native": "a.obj", "backend": {"name": "anny"}}, InputError, "native: got a mesh and a backend"),
         ({"native": "a.fbx"}, InputError, "native: got the suffix '.fbx'"),
         ({"native": "missing.obj"}, AssetError, "missing.obj"),
-        ({"backend": "soma"}, InputError, "backend: got soma, expected a backend with a topology of its own"),
+        (
+            {"backend": {"name": "soma"}},
+            InputError,
+            "backend: got soma, expected a backend with a topology of its own",
+        ),
         ({"up": "up"}, InputError, "up: got 'up', expected"),
         ({"mask": "missing.json"}, AssetError, "missing.json: cannot be read"),
     ],
@@ -220,3 +225,11 @@ def test_the_picture_is_drawn(tmp_path: Path, body: Path, seen) -> None:
     assert pixels.shape[1] == 4 * 430
     for column in range(4):  # no cell is empty
         assert pixels[50:600, 430 * column : 430 * (column + 1)].std() > 5
+
+
+def test_the_command_line_chooses_a_backend(
+    tmp_path: Path, seen, monkeypatch: pytest.MonkeyPatch, capsys
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert main(["wrap", "backend=soma"]) == EXIT_USAGE
+    assert "backend: got soma, expected a backend with a topology of its own" in capsys.readouterr().err
