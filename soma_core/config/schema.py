@@ -263,7 +263,7 @@ class BenchConfig:
 class WrapConfig:
     """Configuration of ``soma wrap``."""
 
-    backend: BackendChoice = field(default_factory=BackendChoice)
+    backend: BackendChoice | None = None
     native: str | None = None
     out: str | None = None
     unit: LengthUnit | None = None

@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
-from omegaconf import OmegaConf
 
 from soma_core.backends.parameters import batch_parameters
 from soma_core.cache import atomic_write
@@ -100,7 +99,7 @@ def _say(found: Registration, quality: Quality, pair: WrapPair, fill: Sequence[s
 
 
 def _read_native(config: DictConfig) -> _Native:
-    chosen = not OmegaConf.is_missing(config.backend, "name")
+    chosen = config.backend is not None
     if chosen == (config.native is not None):
         raise InputError(
             "native",
