@@ -17,7 +17,7 @@ import numpy as np
 from inputs import own_motion, own_rig_meshes
 from processes import Worker, medians_of_rounds
 
-__all__ = ["inversion_table", "run_inversion"]
+__all__ = ["PEER_METHODS", "inversion_table", "run_inversion"]
 
 LODS = ("low", "mid")
 OURS, REFERENCE = "gauss_newton", "analytical"
@@ -56,7 +56,7 @@ def _compare(
 ) -> list[dict]:
     """Errors of every method, then times."""
     ours, peer = workers
-    methods = [(ours, OURS), *((peer, method) for method in PEER_METHODS)]
+    methods = [(ours, OURS), *((peer, method) for method in options.peer_methods)]
     rows = []
     for worker, method in methods:
         request = {"case": f"{lod}/{method}", "inputs": file, "warm": 0 if method in SLOW else 1}
@@ -70,7 +70,8 @@ def _compare(
     quick = [(f"{worker.name} {method}", worker, {"case": f"{lod}/{method}", "inputs": file})
              for worker, method in methods if method not in SLOW]  # fmt: skip
     times = medians_of_rounds(quick, rounds=options.rounds, seconds=options.seconds, least=2)
-    slow = [(f"peer {method}", peer, {"case": f"{lod}/{method}", "inputs": file}) for method in SLOW]
+    slow = [(f"peer {method}", peer, {"case": f"{lod}/{method}", "inputs": file}) for method in SLOW
+            if method in options.peer_methods]  # fmt: skip
     times |= medians_of_rounds(slow, rounds=1, seconds=0.0, least=1)
     mine = times[f"ours {OURS}"]
     for row in rows:

@@ -23,7 +23,7 @@ from pathlib import Path
 
 import numpy as np
 from inputs import forward_inputs
-from inversion import inversion_table, run_inversion
+from inversion import PEER_METHODS, inversion_table, run_inversion
 from processes import HERE, ROOT, Worker, cpu_name, medians_of_rounds, short_commit
 
 SAME_MM = {"soma": 5.0, "anny": 5.0}
@@ -173,6 +173,9 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=1.0, help="of each implementation in each round")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--frames", type=int, default=100, help="of each sequence that is inverted")
+    parser.add_argument(
+        "--peer-methods", nargs="+", default=PEER_METHODS, choices=PEER_METHODS, help="of pose inversion"
+    )
     options = parser.parse_args()
     options.peer_python = str(Path(options.peer_python).absolute())
     with tempfile.TemporaryDirectory() as name:
