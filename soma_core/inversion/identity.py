@@ -36,8 +36,8 @@ class IdentityFit:
         params: the backend's parameters of that shape; when unposed, of the shape it began from.
         pose: of every frame under the identity.
         frames: (n,) numbers of the frames that the identity was estimated from.
-        history: root mean square vertex error [m] over those frames at the start and after each step. It
-            rises where vertices that no body of the backend explains begin to count less.
+        history: root mean square vertex error [m] over those frames at the start and after each step, while
+            joint centres may move. It rises where vertices that are not explained begin to count less.
         converged: whether the last step no longer changed the error noticeably.
     """
 
@@ -66,8 +66,8 @@ def fit_identity(
     """Recover rest shape and poses together, one identity for all frames.
 
     ``backend`` moves the backend's parameters: Gauss-Newton steps on the error that is left once every frame
-    has taken its best pose, from several starts where parameters are bounded. A second descent gives less
-    weight to vertices that no such body explains: another model bends its skin differently.
+    has taken its best pose, from several starts where parameters are bounded. Another model turns its body
+    about other joints: joint centres may move meanwhile, and what no body explains comes to count less.
     ``unpose`` goes on from there and lets every vertex of the rest shape move, for people that the backend
     cannot describe; it takes the other model's way of bending skin for shape, though.
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Protocol
 
 import numpy as np
 import scipy.optimize
@@ -10,6 +11,7 @@ import torch
 from torch import Tensor
 
 from soma_core.inversion.fit import PoseInversion
+from soma_core.inversion.free_joints import WithJoints
 from soma_core.inversion.free_parameters import FreeParameters
 from soma_core.inversion.result import InversionResult
 from soma_core.inversion.shape_response import shape_normal_equations
@@ -38,6 +40,22 @@ _LOWER, _RAISE, _TRIES = 0.2, 8.0, 5
 
 _NOTICEABLE = 3e-4
 """A step that lowers the error by less, relatively, is the last."""
+
+
+class Unknowns(Protocol):
+    """What a search moves in: :class:`FreeParameters`, or those :class:`WithJoints`."""
+
+    start: np.ndarray
+    lower: np.ndarray
+    upper: np.ndarray
+
+    def identities(self, points: np.ndarray) -> Identity:
+        """Identities of (m, k) points."""
+        ...
+
+    def inward(self, point: np.ndarray, length: float) -> np.ndarray:
+        """Steps (k,) of `length` away from the nearer bound."""
+        ...
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -84,7 +102,8 @@ class ShapeFound:
 
     Attributes:
         identity: batch of 1.
-        history: root mean square error [m] at the start, and after each accepted step.
+        history: root mean square error [m] at the start, and after each accepted step, joints in their best
+            places.
         converged: whether it ended before its steps did.
     """
 
@@ -108,36 +127,41 @@ def search_parameters(
 ) -> ShapeFound:
     """Minimise the error over the parameters, every frame in its best pose.
 
-    A first descent takes all vertices alike. Where two models bend their skin differently, that error is
-    no fault of the shape, and a second descent lets vertices count by how well they are explained.
+    Two models that share a rest shape turn it about other joint centres and bend their skin differently;
+    neither is a fault of the shape. Joint centres are therefore unknowns too, to be dropped in the end, and a
+    second descent lets vertices count by how well they are explained.
     """
     few = _Search(inversion, sample.some(_FEW_FRAMES), parameters)
-    found = [few.descend(point, _PLAIN, min(iterations, _FEW_STEPS))[0] for point in few.starts()]
+    found = [few.descend(point, _PLAIN, min(iterations, _FEW_STEPS))[0] for point in _starts(few, parameters)]
     best = min(found, key=lambda state: float(few.sample.mean(state.squares)))
-    whole = _Search(inversion, sample, parameters)
-    state, _ = whole.descend(best.point, _PLAIN, iterations)
+    unknowns = WithJoints(parameters, inversion.layer)
+    whole = _Search(inversion, sample, unknowns)
+    count = len(best.point)
+    state, _ = whole.descend(np.concatenate((best.point, unknowns.start[count:])), _PLAIN, iterations)
     state, converged = whole.descend(state.point, _ROBUST, iterations)
-    return ShapeFound(identity=state.identity, history=tuple(whole.history), converged=converged)
+    identity = parameters.identities(state.point[None, :count])
+    return ShapeFound(identity=identity, history=tuple(whole.history), converged=converged)
+
+
+def _starts(search: _Search, parameters: FreeParameters) -> list[np.ndarray]:
+    """The given start, and the best of bodies spread over the bounded parameters."""
+    spread = parameters.spread(_CANDIDATES)
+    errors = [search.errors(spread[k : k + _AT_A_TIME]) for k in range(0, len(spread), _AT_A_TIME)]
+    order = np.argsort(np.concatenate(errors)) if errors else []
+    return [parameters.start, *(spread[index] for index in order[: _STARTS - 1])]
 
 
 class _Search:
-    """Levenberg-Marquardt over parameters on some frames; `history` grows with every accepted step."""
+    """Levenberg-Marquardt over the unknowns on some frames; `history` grows with every accepted step."""
 
-    def __init__(self, inversion: PoseInversion, sample: Sample, parameters: FreeParameters) -> None:
-        self.inversion, self.sample, self.parameters = inversion, sample, parameters
+    def __init__(self, inversion: PoseInversion, sample: Sample, unknowns: Unknowns) -> None:
+        self.inversion, self.sample, self.unknowns = inversion, sample, unknowns
         self.history: list[float] = []
 
-    def starts(self) -> list[np.ndarray]:
-        """The given start, and the best of bodies spread over the bounded parameters."""
-        spread = self.parameters.spread(_CANDIDATES)
-        errors = [self._errors(spread[k : k + _AT_A_TIME]) for k in range(0, len(spread), _AT_A_TIME)]
-        order = np.argsort(np.concatenate(errors)) if errors else []
-        return [self.parameters.start, *(spread[index] for index in order[: _STARTS - 1])]
-
-    def _errors(self, points: np.ndarray) -> np.ndarray:
+    def errors(self, points: np.ndarray) -> np.ndarray:
         """Mean squared errors (m,) of several bodies, each in its best pose."""
         count = len(self.sample.vertices)
-        bodies = self.parameters.identities(np.repeat(points, count, 0))
+        bodies = self.unknowns.identities(np.repeat(points, count, 0))
         vertices = self.sample.vertices.repeat(len(points), 1, 1)
         weights = self.sample.weights
         weights = weights.repeat(len(points), 1) if len(weights) > 1 else weights
@@ -175,7 +199,7 @@ class _Search:
         self.history.append(float(self.sample.mean(state.squares).sqrt()))
 
     def _state(self, point: np.ndarray, trust: Tensor) -> _State:
-        identity = self.parameters.identities(point[None])
+        identity = self.unknowns.identities(point[None])
         pose = self.inversion(self.sample.vertices, identity, weights=self.sample.weights * trust)
         return _State(point=point, identity=identity, pose=pose, squares=self.sample.squares(pose))
 
@@ -187,14 +211,14 @@ class _Search:
         return float(self._loss(state, scale)) + prior * float((state.point**2).sum())
 
     def _normal_equations(self, state: _State, trust: Tensor, prior: float) -> tuple[np.ndarray, np.ndarray]:
-        steps = self.parameters.inward(state.point, _STEP)
+        steps = self.unknowns.inward(state.point, _STEP)
         points = state.point + np.concatenate((np.zeros((1, len(steps))), np.diag(steps)))
         matrix, slope = shape_normal_equations(
             self.inversion,
             self.sample.vertices,
             self.sample.weights * trust,
             state.pose,
-            self.parameters.identities(points),
+            self.unknowns.identities(points),
             torch.as_tensor(steps, device=trust.device),
         )
         total = float(self.sample.weights.expand(len(self.sample.vertices), -1).double().sum())
@@ -208,6 +232,6 @@ class _Search:
         damped = matrix + damping * np.diag(np.diag(matrix))
         factor = np.linalg.cholesky(damped)
         goal = scipy.linalg.solve_triangular(factor, -slope, lower=True)
-        bounds = self.parameters.lower - point, self.parameters.upper - point
+        bounds = self.unknowns.lower - point, self.unknowns.upper - point
         found = scipy.optimize.lsq_linear(factor.T, goal, bounds, method="bvls")
         return point + found.x
