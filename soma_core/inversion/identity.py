@@ -73,10 +73,8 @@ def fit_identity(
 
     Args:
         layer: the backend and the LOD of the fit.
-        vertices: (F, n, 3), as in :class:`PoseInversion`.
-        topology: ``canonical`` or ``native``, the backend's own.
+        vertices, topology, weights: as in :class:`PoseInversion`.
         method: ``backend`` or ``unpose``.
-        weights: (v,) or (F, v) weights of canonical vertices; see :class:`PoseInversion`.
         start: parameters to begin from; what is left out has its default.
         free: names of the parameters to fit; default as in :class:`FreeParameters`. With ``unpose`` it may
             be empty: unposing then begins from `start` itself.
