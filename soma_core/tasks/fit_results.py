@@ -86,7 +86,13 @@ def joined_report(chunks: FittedChunks, layer: SomaLayer) -> InversionReport:
 
 
 def fitted_motions(
-    chunks: FittedChunks, layer: SomaLayer, *, fps: float, source: str, params: Mapping[str, Any]
+    chunks: FittedChunks,
+    layer: SomaLayer,
+    *,
+    fps: float,
+    source: str,
+    identity: Mapping[str, Any],
+    licence: str = "",
 ) -> Iterator[Motion]:
     """The fitted motion, a chunk at a time."""
     for rotations, translation in chunks.load_all("rotations", "translation"):
@@ -97,7 +103,8 @@ def fitted_motions(
             joint_names=layer.joint_names,
             rig_revision=layer.rig.revision,
             source=source,
-            identity={"backend": layer.backend, "params": params},
+            identity=identity,
+            licence=licence,
         )
 
 
