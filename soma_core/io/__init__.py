@@ -7,6 +7,7 @@ from soma_core.io.gltf import write_gltf
 from soma_core.io.joint_order import USER_JOINTS
 from soma_core.io.motion import Convention, Motion
 from soma_core.io.motion_files import check_rig, read_motion, write_motion, write_motion_parts
+from soma_core.io.sam3d import Sam3dFrames, read_sam3d
 from soma_core.io.usd import write_usd
 from soma_core.io.vertex_files import open_vertex_sequence
 from soma_core.io.vertex_sequence import VertexSequence
@@ -15,11 +16,13 @@ __all__ = [
     "USER_JOINTS",
     "Convention",
     "Motion",
+    "Sam3dFrames",
     "SkinnedClip",
     "VertexSequence",
     "check_rig",
     "open_vertex_sequence",
     "read_motion",
+    "read_sam3d",
     "skinned_clip",
     "write_gltf",
     "write_motion",
