@@ -14,7 +14,7 @@ import numpy as np
 from soma_core.cache import atomic_write
 from soma_core.errors import InputError
 
-__all__ = ["FittedChunks"]
+__all__ = ["FittedChunks", "refuse_other_settings"]
 
 
 class FittedChunks:
@@ -35,7 +35,7 @@ class FittedChunks:
         plan = json.loads(json.dumps({**settings, "chunk": size, "frames": frame_count}, default=str))
         file = folder / "settings.json"
         if file.is_file():
-            _refuse_others(folder, json.loads(file.read_text(encoding="utf-8")), plan)
+            refuse_other_settings(folder, json.loads(file.read_text(encoding="utf-8")), plan)
             return
         text = json.dumps(plan, indent=2) + "\n"
         atomic_write(file, lambda path: path.write_text(text, encoding="utf-8") and None)
@@ -74,8 +74,12 @@ class FittedChunks:
         return self._file(number).is_file() and zipfile.is_zipfile(self._file(number))
 
 
-def _refuse_others(folder: Path, stored: Mapping[str, Any], plan: Mapping[str, Any]) -> None:
-    """Refuse to mix chunks of two configurations."""
+def refuse_other_settings(folder: Path, stored: Mapping[str, Any], plan: Mapping[str, Any]) -> None:
+    """Refuse to go on with results of another configuration, which lie at `folder`.
+
+    Raises:
+        InputError: a setting differs; the first one is named with both values.
+    """
     different = [key for key in {**stored, **plan} if stored.get(key) != plan.get(key)]
     if different:
         key = different[0]
