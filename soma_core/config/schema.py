@@ -19,6 +19,9 @@ __all__ = [
     "Experiment",
     "FrameRange",
     "Gallery",
+    "IdentityChoice",
+    "IdentityMethod",
+    "IdentitySource",
     "InversionChoice",
     "InvertConfig",
     "Kernels",
@@ -41,6 +44,21 @@ class Gallery(StrEnum):
 
     one = "one"
     all = "all"
+
+
+class IdentityMethod(StrEnum):
+    """How the identity of a fit is found, if it is not known."""
+
+    known = "known"
+    backend = "backend"
+    unpose = "unpose"
+
+
+class IdentitySource(StrEnum):
+    """Which identity is animated."""
+
+    backend = "backend"
+    motion = "motion"
 
 
 class Kernels(StrEnum):
@@ -132,6 +150,7 @@ class AnimateConfig:
     backends: Gallery = Gallery.one
     motion: str | None = None
     motion_fps: float | None = None
+    identity_from: IdentitySource = IdentitySource.backend
     frames: FrameRange = field(default_factory=FrameRange)
     translation: Translation = Translation.ground
     lod: Lod = Lod.mid
@@ -191,10 +210,21 @@ class InversionChoice:
 
 
 @dataclass
+class IdentityChoice:
+    """Whose poses are sought: a known identity, or one found from some of the frames."""
+
+    method: IdentityMethod = IdentityMethod.known
+    free: list[str] | None = None
+    frames: int = 20
+    iterations: int = 12
+
+
+@dataclass
 class InvertConfig:
     """Configuration of ``soma invert``."""
 
     backend: BackendChoice = field(default_factory=BackendChoice)
+    identity: IdentityChoice = field(default_factory=IdentityChoice)
     inversion: InversionChoice = field(default_factory=InversionChoice)
     input: str | None = None
     fps: float | None = None

@@ -212,7 +212,8 @@ def _identity(identity: Mapping[str, object]) -> dict[str, object]:
     plain = {name: np.asarray(value, np.float64).tolist() for name, value in params.items()}
     row = np.concatenate([np.empty(0), *(np.ravel(value) for value in plain.values())])[None]
     coefficients = identity.get("identity_coeffs", row)
-    return {
+    rest = {"identity_rest": np.asarray(identity["rest"], np.float32)} if "rest" in identity else {}
+    return rest | {
         "identity_model_type": str(identity.get("backend", "")),
         "identity_params": json.dumps(plain, sort_keys=True),
         "identity_coeffs": np.asarray(coefficients, np.float32),

@@ -176,12 +176,27 @@ def _identity(fields: NpzFields) -> dict[str, object]:
     if not backend:
         return {}
     if "identity_params" in fields:
-        return {"backend": backend, "params": _parsed(fields)}
+        return {"backend": backend, "params": _parsed(fields), **_rest(fields)}
     found: dict[str, object] = {"backend": backend}
     for key in ("identity_coeffs", "scale_params"):
         if key in fields and fields.raw(key).dtype.kind == "f":
             found[key] = fields.raw(key).astype(np.float32)
     return found
+
+
+def _rest(fields: NpzFields) -> dict[str, object]:
+    """A rest shape (v, 3) [m] that no parameters describe."""
+    if "identity_rest" not in fields:
+        return {}
+    rest = fields.raw("identity_rest")
+    if rest.dtype.kind != "f" or rest.ndim != 2 or rest.shape[1] != 3:
+        raise fields.refuse(
+            "identity_rest",
+            got=f"{rest.dtype} of shape {rest.shape}",
+            expected="vertices (v, 3) [m] as floating point numbers",
+            fix="Write the rest shape on the canonical mesh.",
+        )
+    return {"rest": rest.astype(np.float32)}
 
 
 def _parsed(fields: NpzFields) -> dict[str, object]:

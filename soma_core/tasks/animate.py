@@ -24,6 +24,7 @@ from soma_core.paths import assets_dir
 from soma_core.progress import progress
 from soma_core.tasks.picture import backend_colour, contact_sheet
 from soma_core.tasks.stage import Body
+from soma_core.tasks.stored_identity import backend_of, stored_identity
 
 if TYPE_CHECKING:
     from omegaconf import DictConfig
@@ -69,20 +70,22 @@ def run(config: DictConfig, output: Path) -> None:
         draw_gallery(config, output / "gallery.png")
         return
     motion = load_motion(config)
+    kept = str(config.identity_from) == "motion"
     layer = SomaLayer(
-        config.backend.name,
+        backend_of(motion) if kept else config.backend.name,
         options=given_params(config.backend.options),
         lod=str(config.lod),
         device=config.device,
         kernels=str(config.kernels),
     )
-    params = given_params(config.backend.params)
+    stored = {"backend": layer.backend, "params": given_params(config.backend.params)}
+    stored = dict(motion.identity) if kept else stored
     _log.info("%s: %d frames at %g fps", motion.source, motion.frame_count, motion.fps)
     with torch.no_grad():
-        identity = layer.identity(params)
+        identity = stored_identity(layer, stored)
         shown = _shown_frames(motion.frame_count, config.picture.frames)
         result = animate(layer, identity, motion, translation=str(config.translation), keep=shown)
-    motion = replace(result.motion, identity={"backend": layer.backend, "params": params})
+    motion = replace(result.motion, identity=stored)
     _write(config, output, layer, identity, replace(result, motion=motion))
 
 

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import logging
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import torch
+from omegaconf import OmegaConf
 
 from soma_core.errors import InputError
 from soma_core.inversion import PoseInversion
@@ -17,7 +18,9 @@ from soma_core.layer import SomaLayer
 from soma_core.tasks.animate import given_params
 from soma_core.tasks.fit_job import FitJob, ResultFiles, fingerprint, fit_settings
 from soma_core.tasks.fitted_chunks import FittedChunks
+from soma_core.tasks.found_identity import found_identity
 from soma_core.tasks.posed_input import PosedInput
+from soma_core.tasks.stored_identity import stored_identity
 
 if TYPE_CHECKING:
     from omegaconf import DictConfig
@@ -86,6 +89,7 @@ def _prepare(config: DictConfig, sequence: VertexSequence, output: Path) -> FitJ
         "backend": layer.backend,
         "params": params,
         "options": options,
+        "identity": _identity_settings(config),
         "lod": layer.mesh.lod,
         "inversion": fit_settings(config.inversion),
         "rig": layer.rig.revision,
@@ -99,7 +103,21 @@ def _prepare(config: DictConfig, sequence: VertexSequence, output: Path) -> FitJ
     fit = PoseInversion(
         layer, **inversion_options(settings["inversion"]), kernels=str(config.inversion.kernels)
     )
+    stored = {"backend": layer.backend, "params": params}
+    if settings["identity"]["method"] != "known":
+        file = chunks.folder / "identity.npz"
+        stored, search = found_identity(file, layer, posed, params, settings["identity"])
+        settings["identity"] = {**search, "params": stored["params"]}
+        with torch.no_grad():
+            identity = stored_identity(layer, stored)
     return FitJob(
-        inversion=fit, identity=identity, stored={"backend": layer.backend, "params": params}, posed=posed,
-        chunks=chunks, settings=settings, files=ResultFiles.of_folder(output), picture=config.picture,
+        inversion=fit, identity=identity, stored=stored, posed=posed, chunks=chunks, settings=settings,
+        files=ResultFiles.of_folder(output), picture=config.picture,
     )  # fmt: skip
+
+
+def _identity_settings(config: DictConfig) -> dict[str, Any]:
+    """The group ``identity``, of which nothing but the method matters where the identity is known."""
+    values = OmegaConf.to_container(config.identity, resolve=True)
+    method = str(config.identity.method)
+    return {**values, "method": method} if method != "known" else {"method": method}

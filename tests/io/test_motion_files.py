@@ -91,6 +91,14 @@ def test_round_trip_is_exact(motion, tmp_path):
         assert getattr(again, name) == getattr(motion, name), name
 
 
+def test_a_rest_shape_goes_with_its_motion(motion, tmp_path):
+    rest = np.arange(12, dtype=np.float32).reshape(4, 3)
+    write_motion(replace(motion, identity={**motion.identity, "rest": rest}), tmp_path / "m.npz")
+    found = read_motion(tmp_path / "m.npz").identity
+    assert found["params"] == motion.identity["params"]
+    np.testing.assert_array_equal(found["rest"], rest)
+
+
 def test_rotation_vectors_round_trip_to_rounding(motion, tmp_path):
     write_motion(motion, tmp_path / "motion.npz", rotation_repr="rotvec")
     again = read_motion(tmp_path / "motion.npz")
@@ -153,6 +161,7 @@ def test_a_failed_write_leaves_the_old_file(motion, tmp_path, monkeypatch):
         ("source", np.array(["a", "b"]), r"source: got 2 texts"),
         ("source", 3.0, r"source: got dtype float64, expected text"),
         ("identity_params", "{age", r"identity_params: got '\{age'"),
+        ("identity_rest", np.zeros((4, 2)), r"identity_rest: got float64 of shape \(4, 2\)"),
     ],
 )
 def test_a_bad_value_is_refused_by_name(motion, tmp_path, key, value, text):

@@ -1,0 +1,85 @@
+"""One identity for all frames of a fit: found from them, and kept so that a run that goes on has the same."""
+
+from __future__ import annotations
+
+import json
+import logging
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+
+from soma_core.cache import atomic_write
+from soma_core.inversion import fit_identity
+
+if TYPE_CHECKING:
+    from soma_core.inversion.identity import IdentityFit
+    from soma_core.layer import SomaLayer
+    from soma_core.tasks.posed_input import PosedInput
+
+__all__ = ["found_identity"]
+
+_log = logging.getLogger(__name__)
+
+
+@torch.no_grad()
+def found_identity(
+    file: Path, layer: SomaLayer, posed: PosedInput, params: Mapping[str, Any], choice: Mapping[str, Any]
+) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Find one identity for all frames, or read what an earlier run found.
+
+    Args:
+        file: NPZ that keeps what was found.
+        layer, posed: the backend and the frames.
+        params: where the search begins.
+        choice: ``method``, ``free``, ``frames`` and ``iterations`` of :func:`fit_identity`.
+
+    Returns:
+        What a motion file keeps of the identity: backend, parameters, and the rest shape (v, 3) [m] of an
+        unposed one. And how it was found, for the report.
+
+    Raises:
+        InputError: as :func:`fit_identity`.
+    """
+    if not file.is_file():
+        found = _search(layer, posed, params, choice)
+        atomic_write(file, lambda path: _write(path, found, choice))
+    with open(file, "rb") as stream, np.load(stream, allow_pickle=False) as fields:
+        kept = {name: fields[name] for name in fields.files}
+    search, values = (json.loads(str(kept.pop(name))) for name in ("search", "params"))
+    return {"backend": layer.backend, "params": values, **kept}, search
+
+
+def _search(
+    layer: SomaLayer, posed: PosedInput, params: Mapping[str, Any], choice: Mapping[str, Any]
+) -> IdentityFit:
+    """Fit to frames spread over the sequence, read one by one."""
+    total = posed.sequence.frame_count
+    spread = np.unique(np.linspace(0, total - 1, min(max(choice["frames"], 1), total)).round().astype(int))
+    _log.info("finding the identity from %d frames", len(spread))
+    vertices = np.concatenate([posed.read(frame, frame + 1) for frame in spread.tolist()])
+    found = fit_identity(
+        layer,
+        torch.as_tensor(vertices).to(layer.device, layer.dtype),
+        topology=posed.topology,
+        start=params,
+        **choice,
+    )
+    short = {name: value.item() for name, value in found.params.items() if value.numel() == 1}
+    if short:
+        _log.info("found %s", ", ".join(f"{name}={value:.3g}" for name, value in short.items()))
+    return found
+
+
+def _write(path: Path, found: IdentityFit, choice: Mapping[str, Any]) -> None:
+    params = {name: value[0].double().cpu().tolist() for name, value in found.params.items()}
+    search = {
+        **choice, "frames": len(found.frames), "steps": len(found.history) - 1, "converged": found.converged
+    }  # fmt: skip
+    arrays = {"params": np.array(json.dumps(params)), "search": np.array(json.dumps(search))}
+    if choice["method"] == "unpose":
+        arrays["rest"] = found.identity.fitted_rest[0].cpu().numpy()
+    with open(path, "wb") as stream:
+        np.savez_compressed(stream, **arrays)
