@@ -31,6 +31,7 @@ RANKS = [
     {"backends", "io"},
     {"layer"},
     {"inversion"},
+    {"native"},
     {"config", "registration", "shape_space", "template", "testing"},
     {"evaluation"},
     {"tasks"},

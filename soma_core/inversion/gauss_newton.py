@@ -109,10 +109,10 @@ class GaussNewton(torch.nn.Module):
             matrix, slope = self.normal_equations(turns, places, rest.second, residual)
             if terms is not None:
                 self.add_terms(matrix, slope, pose.relative, turns, terms, mass)
-            step = self._solve(matrix, slope, damping)
+            step = self.damped_step(matrix, slope, damping)
             if terms is not None:
                 step = self._along_hinges(step, turns, terms)
-            trial = self._retract(pose, turns, step)
+            trial = self.retract(pose, turns, step)
             trial_turns, trial_places = self.walk(trial, rest.offsets)
             change = torch.cat((trial_turns - turns, (trial_places - places)[..., None]), -1)[:, self.joints]
             product = self.times_second(change, second)
@@ -304,7 +304,7 @@ class GaussNewton(torch.nn.Module):
         )
         return torque, force
 
-    def _solve(self, matrix: Tensor, slope: Tensor, damping: Tensor) -> Tensor:
+    def damped_step(self, matrix: Tensor, slope: Tensor, damping: Tensor) -> Tensor:
         """Damped step (F, n + 1, 3); Cholesky only, and no error check, so nothing waits for the device."""
         matrix, flat = matrix.flatten(3, 4).flatten(1, 2), slope.flatten(1)
         diagonal = matrix.diagonal(dim1=-2, dim2=-1)
@@ -316,7 +316,7 @@ class GaussNewton(torch.nn.Module):
         short = torch.clamp(_LONGEST_STEP / length.clamp_min(1e-12), max=1)
         return torch.cat((step[:, :-1] * short, step[:, -1:]), 1)
 
-    def _retract(self, pose: Pose, turns: Tensor, step: Tensor) -> Pose:
+    def retract(self, pose: Pose, turns: Tensor, step: Tensor) -> Pose:
         """Turn every variable joint by its step, in the axes of its parent, and remove rounding."""
         n = self.variables
         local = turns[:, self.parents[n]].transpose(-1, -2) @ step[:, :-1, :, None]

@@ -10,7 +10,7 @@ import scipy.sparse
 from soma_core.rig.mesh import CanonicalMesh
 from soma_core.rig.skeleton import Rig
 
-__all__ = ["MomentStructure", "moment_structure"]
+__all__ = ["MomentStructure", "moment_structure", "skin_structure"]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -54,9 +54,19 @@ class MomentStructure:
 
 
 def moment_structure(mesh: CanonicalMesh, rig: Rig) -> MomentStructure:
-    """Collect the influences outside the face interior, by joint, and the vertices each two joints share."""
+    """The structure of the canonical rig: all influences outside the face interior."""
     fitted = np.ones(mesh.vertex_count, bool)
     fitted[mesh.face_interior] = False
+    return skin_structure(rig, fitted)
+
+
+def skin_structure(rig: Rig, fitted: np.ndarray) -> MomentStructure:
+    """Collect the influences on `fitted` vertices, by joint, and the vertices each two joints share.
+
+    Args:
+        rig: any skinned mesh whose joint 0 is a virtual root without weight.
+        fitted: (v,) bool, vertices that a fit may look at.
+    """
     weights = scipy.sparse.coo_array(rig.weights)
     chosen = (weights.data > 0) & fitted[weights.row] & (weights.col > 0)
     vertex, joint, weight = weights.row[chosen], weights.col[chosen], weights.data[chosen]

@@ -19,9 +19,11 @@ __all__ = [
     "Generator",
     "HasLinearBasis",
     "HasPosed",
+    "HasSkinning",
     "HasTriangles",
     "LinearBasis",
     "Parameter",
+    "SkinnedModel",
     "Unit",
     "WrapPair",
 ]
@@ -165,6 +167,42 @@ class HasPosed(Protocol):
 
     def posed(self, params: Mapping[str, Tensor], pose: Any) -> Tensor:
         """Posed vertices (batch, n, 3) in the native unit, topology and axes."""
+        ...
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class SkinnedModel:
+    """Bodies of a native model as meshes that joints skin; native unit and axes.
+
+    Joint j turns by a local rotation about its place, and all that hangs on it. Rotations are relative to
+    the rest mesh, in axes aligned with the native world there; identity is the rest mesh. A vertex is
+    ``sum_j w_vj (W_j (rest_v + offset_v - joint_j) + place_j) + translation``, W_j and place_j the world
+    rotation and the place of joint j, where the root joint stays in place.
+
+    Attributes:
+        joint_names: in the model's order, parents first.
+        parents: index of the parent of each joint, -1 for the first, which is the only root.
+        rest: (batch, n, 3) rest meshes.
+        joints: (batch, J, 3) their joints.
+        weights: (n, J) skinning weights, rows sum to 1.
+        pose_offsets: maps local rotations (batch, J, 3, 3) to what they add to the rest mesh before it is
+            skinned, (batch, n, 3); differentiable. None where a pose adds nothing.
+    """
+
+    joint_names: tuple[str, ...]
+    parents: tuple[int, ...]
+    rest: Tensor
+    joints: Tensor
+    weights: Tensor
+    pose_offsets: Callable[[Tensor], Tensor] | None = None
+
+
+@runtime_checkable
+class HasSkinning(Protocol):
+    """Optional capability: lets the core fit the model's own pose to a motion."""
+
+    def skinning(self, params: Mapping[str, Tensor]) -> SkinnedModel:
+        """The bodies of the params of :meth:`Generator.rest`."""
         ...
 
 

@@ -30,6 +30,8 @@ _CANONICAL = {
     "hand": "HandMiddle1",
 }  # fmt: skip
 _REGRESSOR_VERTICES = 24
+_FAR_REACH = 0.05
+"""How much a joint's pose blend shapes move distant parts, relative to its own: little, but not nothing."""
 _ADULTS = 0.4
 """Part of the spread of the shape space, which goes from newborn to old age."""
 
@@ -82,7 +84,10 @@ def smpl_arrays(name: str, *, width: int) -> dict[str, np.ndarray]:
     mix[:own] = np.eye(own)[:width]  # the leading directions are those of the shape space
     directions = _ADULTS * np.einsum("wk,knc->ncw", mix, body.directions)
     poses = 9 * (family.joint_count - 1)
-    amplitude = 1e-3 * random.standard_normal((family.joint_count, poses))
+    near = np.full((family.joint_count, family.joint_count - 1), _FAR_REACH)
+    for joint, parent in enumerate(family.parents[1:]):
+        near[[joint + 1, parent], joint] = 1
+    amplitude = 1e-3 * near.repeat(9, 1) * random.standard_normal((family.joint_count, poses))
     correctives = (weights @ amplitude)[:, None] * random.standard_normal((3, poses))
     return {
         "v_template": body.vertices,

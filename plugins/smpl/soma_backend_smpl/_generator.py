@@ -12,7 +12,7 @@ from torch import Tensor
 from soma_backend_smpl._model_file import ModelFile
 from soma_core.errors import InputError
 from soma_core.geometry.rotations import axis_angle_to_matrix
-from soma_core.plugin.spec import LinearBasis
+from soma_core.plugin.spec import LinearBasis, SkinnedModel
 
 __all__ = ["SmplGenerator"]
 
@@ -84,12 +84,32 @@ class SmplGenerator:
             rest = rest + self._expression(pose["expression"])
         rotations, rest = _one_batch(rotations, rest)
         joints = self._regressor @ rest
-        change = rotations[:, 1:] - torch.eye(3, dtype=rotations.dtype, device=rotations.device)
-        shaped = rest + (change.flatten(1) @ self._pose_directions).unflatten(1, (-1, 3))
+        shaped = rest + self._pose_offsets(rotations)
         world = self._world(rotations, joints)
         skin = torch.einsum("vj,bjrc->bvrc", self._weights, world)
         posed = torch.einsum("bvrc,bvc->bvr", skin[..., :3], shaped) + skin[..., 3]
         return posed + pose["translation"][:, None] if "translation" in pose else posed
+
+    def skinning(self, params: Mapping[str, Tensor]) -> SkinnedModel:
+        """What :meth:`posed` skins, without expression."""
+        rest = self.rest(params)
+        return SkinnedModel(
+            joint_names=self.family.joint_names,
+            parents=self.family.parents,
+            rest=rest,
+            joints=self._regressor @ rest,
+            weights=self._weights,
+            pose_offsets=self._pose_offsets,
+        )
+
+    def triangles(self) -> Tensor:
+        """Native vertex ids (t, 3)."""
+        return torch.as_tensor(self._model.faces.astype(np.int64), device=self._template.device)
+
+    def _pose_offsets(self, rotations: Tensor) -> Tensor:
+        """Pose blend shapes (batch, v, 3) [m] of local rotations (batch, J, 3, 3)."""
+        change = rotations[:, 1:] - torch.eye(3, dtype=rotations.dtype, device=rotations.device)
+        return (change.flatten(1) @ self._pose_directions).unflatten(1, (-1, 3))
 
     def _rotations(self, pose: Mapping[str, Tensor]) -> Tensor:
         known = ("rotations", "translation", "expression")
