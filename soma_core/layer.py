@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from soma_core._inputs import check_bone_scale, check_kind, check_rest, check_rotations, check_translation
-from soma_core.animation.engine import Animation
+from soma_core.animation.engine import Animation, Body, ProceduralAnimation
 from soma_core.animation.posed import Posed
 from soma_core.backends.parameters import batch_parameters
 from soma_core.backends.rest_shape import make_rest_shape
@@ -44,6 +44,7 @@ class SomaLayer(torch.nn.Module):
         exact: evaluate the generator and the transfer vertex by vertex even where the backend is linear
             and could be composed; slower, the reference for tests.
         repose: bring every identity to the rig's bind pose (correctives and twist vanish there).
+        procedural: skin with the rig's twist joints where it has any; without, on the 78 public joints alone.
         validate: check that matrices are rotations. Finiteness is checked on CPU only, since on CUDA
             that would wait for the device.
         canonical: another mesh and rig than the shipped ones.
@@ -65,6 +66,7 @@ class SomaLayer(torch.nn.Module):
         kernels: Kernels = "auto",
         exact: bool = False,
         repose: bool = True,
+        procedural: bool = True,
         validate: bool = True,
         canonical: tuple[CanonicalMesh, Rig] | None = None,
         registry: Registry | None = None,
@@ -72,8 +74,8 @@ class SomaLayer(torch.nn.Module):
         super().__init__()
         self._given = {
             "backend": backend, "options": dict(options or {}), "lod": lod, "kernels": kernels,
-            "exact": exact, "repose": repose, "validate": validate, "canonical": canonical,
-            "registry": registry,
+            "exact": exact, "repose": repose, "procedural": procedural, "validate": validate,
+            "canonical": canonical, "registry": registry,
         }  # fmt: skip
         _check_choice("lod", lod, ("mid", "low"))
         _check_choice("kernels", kernels, ("auto", "torch", "warp"))
@@ -83,6 +85,7 @@ class SomaLayer(torch.nn.Module):
         self.kernels = kernels
         self.exact, self.repose, self.validate = exact, repose, validate
         self.mesh, self.rig = canonical or load_canonical(lod)
+        self.procedural = procedural and self.rig.procedural is not None
         self._registry = registry or default_registry()
         self.spec = self._registry.spec(backend)
         self._build(torch.device(device), dtype)
@@ -97,6 +100,9 @@ class SomaLayer(torch.nn.Module):
             isolated=functools.partial(self._registry.isolated, self.backend),
         )  # fmt: skip
         self.animation = Animation(self.rig, device=device, dtype=dtype, kernels=self.kernels)
+        self.posing = self.animation
+        if self.procedural:
+            self.posing = ProceduralAnimation(self.rig, device=device, dtype=dtype, kernels=self.kernels)
 
     def _apply(self, fn, recurse=True):  # noqa: ARG002 - PyTorch's signature
         """Rebuild for the new device or dtype: constants are derived in float64, never cast twice."""
@@ -177,6 +183,44 @@ class SomaLayer(torch.nn.Module):
             InputError: a wrong shape, dtype or device, a NaN, a matrix that is no rotation, a bone scale
                 that is not positive.
         """
+        _, relative, shift, scale, _ = self._body(identity, rotations, translation, bone_scale)
+        return self.posing.pose(identity, relative, shift, absolute=absolute, bone_scale=scale)
+
+    def pose_plain(
+        self,
+        identity: Identity,
+        rotations: Tensor,
+        translation: Tensor | None = None,
+        *,
+        absolute: bool = False,
+        bone_scale: Tensor | None = None,
+    ) -> Posed:
+        """Pose by linear blend skinning on the public joints alone, without twist joints.
+
+        Takes and raises what :meth:`pose` does. Joints and their transforms are the same; the difference
+        of the vertices is what the twist joints add.
+        """
+        _, relative, shift, scale, _ = self._body(identity, rotations, translation, bone_scale)
+        return self.animation.pose(identity, relative, shift, absolute=absolute, bone_scale=scale)
+
+    def helper_transforms(
+        self, identity: Identity, transforms: Tensor, bone_scale: Tensor | None = None
+    ) -> Tensor:
+        """World transforms of the twist joints of posed bodies, (batch, H, 4, 4) [m]; H = 0 without them.
+
+        Args:
+            identity: what was posed.
+            transforms: ``Posed.transforms``.
+            bone_scale: as given to :meth:`pose`.
+        """
+        if not isinstance(self.posing, ProceduralAnimation):
+            return transforms[:, :0]
+        return self.posing.helper_transforms(identity, transforms, bone_scale)
+
+    def _body(
+        self, identity: Identity, rotations: Tensor, translation: Tensor | None, bone_scale: Tensor | None
+    ) -> Body:
+        """The arguments of `pose`, checked and brought to one batch size."""
         relative = check_rotations(
             rotations, len(self.joint_names), self.dtype, self.device, validate=self.validate
         )
@@ -184,8 +228,7 @@ class SomaLayer(torch.nn.Module):
         batch = _common_batch(identity.batch_size, len(relative))
         shift = check_translation(translation, batch, self.dtype, self.device)
         bone_scale = check_bone_scale(bone_scale, batch, len(self.joint_names), self.dtype, self.device)
-        relative = relative.expand(batch, *relative.shape[1:])
-        return self.animation.pose(identity, relative, shift, absolute=absolute, bone_scale=bone_scale)
+        return Body(identity, relative.expand(batch, *relative.shape[1:]), shift, bone_scale)
 
     def check_identity(self, identity: Identity) -> None:
         """Refuse an identity that another kind of layer made: other rig, LOD, dtype or device.
@@ -231,15 +274,16 @@ class SomaLayer(torch.nn.Module):
         whole = tracked or identities < size or size <= _CHUNK or self.animation.warp_skinning
         if whole:
             identity = self._identity(batch, *self.rest_shape(batch))
-            return self.animation.pose(identity, relative, shift, absolute=absolute, bone_scale=bone_scale)
+            return self.posing.pose(identity, relative, shift, absolute=absolute, bone_scale=bone_scale)
 
-        def body(chunk: slice) -> tuple[Identity, Tensor, Tensor, Tensor | None]:
+        def body(chunk: slice) -> Body:
             part = {name: value[chunk] for name, value in batch.items()}
             scale = None if bone_scale is None else bone_scale.expand(size, -1)[chunk]
-            return self._identity(part, *self.rest_shape(part)), relative[chunk], shift[chunk], scale
+            identity = self._identity(part, *self.rest_shape(part))
+            return Body(identity, relative[chunk], shift[chunk], scale)
 
         bodies = (body(slice(start, start + _CHUNK)) for start in range(0, size, _CHUNK))
-        return self.animation.pose_all(bodies, size, absolute=absolute)
+        return self.posing.pose_all(bodies, size, absolute=absolute)
 
 
 def _common_batch(identities: int, poses: int) -> int:

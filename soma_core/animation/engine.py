@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import torch
 from torch import Tensor
@@ -11,10 +11,21 @@ from torch import Tensor
 from soma_core.animation.kinematics import Kinematics, relative_from_absolute, to_homogeneous
 from soma_core.animation.posed import Posed
 from soma_core.animation.skinning import Skinning, skinning_transforms
+from soma_core.animation.twist import Twist
 from soma_core.rig.skeleton import Rig
 from soma_core.skeleton.identity import Identity
 
-__all__ = ["Animation"]
+__all__ = ["Animation", "Body", "ProceduralAnimation"]
+
+
+class Body(NamedTuple):
+    """What poses a batch of bodies, checked; the fields are the arguments of :meth:`Animation.pose`."""
+
+    identity: Identity
+    relative: Tensor
+    translation: Tensor
+    bone_scale: Tensor | None = None
+    offsets: Tensor | None = None
 
 
 class Animation(torch.nn.Module):
@@ -33,6 +44,7 @@ class Animation(torch.nn.Module):
         self.warp_skinning = kernels == "warp" or (kernels == "auto" and device.type == "cuda")
         self.kinematics = Kinematics(rig, dtype=dtype, device=device, warp=kernels != "torch")
         self.skinning = Skinning(rig.weights, dtype=dtype, device=device)
+        self.posed_skinning = self.skinning
 
     def repose(self, points: Tensor, fitted: Tensor) -> tuple[Tensor, Tensor]:
         """Bring fitted bodies to the rig's bind pose.
@@ -49,7 +61,7 @@ class Animation(torch.nn.Module):
         rotations = kinematics.bind_rotation.expand(len(fitted), -1, 3, 3)
         transforms = skinning_transforms(rotations, positions, fitted)
         if self.warp_skinning:
-            skinned = self._skin_warp(points.permute(2, 1, 0), transforms).permute(2, 1, 0)
+            skinned = _skin_warp(self.skinning, points.permute(2, 1, 0), transforms).permute(2, 1, 0)
         else:
             skinned = self.skinning(points, transforms, rows=False)
         return skinned, to_homogeneous(rotations, positions)
@@ -69,6 +81,7 @@ class Animation(torch.nn.Module):
         *,
         absolute: bool,
         bone_scale: Tensor | None = None,
+        offsets: Tensor | None = None,
     ) -> Posed:
         """Posed bodies; what is given is already checked.
 
@@ -77,38 +90,46 @@ class Animation(torch.nn.Module):
             relative: (B, J - 1, 3, 3), or local rotations of the rig's own axes when `absolute`.
             translation: Hips positions (B, 3) [m].
             bone_scale: factors (1 or B, J - 1) of the user joints' bone vectors; the skin is not refitted.
+            offsets: (B, v, 3) added to the rest shape before skinning [m].
         """
         rotations, positions = self._walk(identity, relative, translation, bone_scale, absolute=absolute)
-        transforms = skinning_transforms(rotations, positions, identity.bind_world)
+        transforms = self._skinning_transforms(identity, rotations, positions, bone_scale)
         return Posed(
-            vertices=self._skin(identity.rest, transforms),
+            vertices=self._skin(_moved(identity.rest, offsets), transforms),
             joints=positions[:, 1:],
             transforms=to_homogeneous(rotations, positions),
         )
 
-    def pose_all(
-        self, bodies: Iterable[tuple[Identity, Tensor, Tensor, Tensor | None]], batch: int, *, absolute: bool
-    ) -> Posed:
-        """Pose a stream of (identity, relative, translation, bone scale) chunks; no derivative.
-
-        Each is dropped after use.
+    def pose_all(self, bodies: Iterable[Body], batch: int, *, absolute: bool) -> Posed:
+        """Pose a stream of chunks; no derivative. Each is dropped after use.
 
         Args:
             bodies: chunks that add up to `batch` bodies, one identity a pose.
             batch: total number of bodies.
         """
         vertices, world, start = None, [], 0
-        for identity, relative, translation, bone_scale in bodies:
+        for identity, relative, translation, bone_scale, moves in bodies:
             if vertices is None:
                 vertices = identity.rest.new_empty(batch, *identity.rest.shape[1:])
             rotations, positions = self._walk(identity, relative, translation, bone_scale, absolute=absolute)
-            transforms = skinning_transforms(rotations, positions, identity.bind_world)
+            transforms = self._skinning_transforms(identity, rotations, positions, bone_scale)
             stop = start + len(relative)
-            self.skinning.into(vertices[start:stop], identity.rest.permute(2, 1, 0), transforms)
+            rest = _moved(identity.rest, moves)
+            self.posed_skinning.into(vertices[start:stop], rest.permute(2, 1, 0), transforms)
             world.append(to_homogeneous(rotations, positions))
             start = stop
         joined = torch.cat(world)
         return Posed(vertices=vertices, joints=joined[:, 1:, :3, 3], transforms=joined)
+
+    def _skinning_transforms(
+        self,
+        identity: Identity,
+        rotations: Tensor,
+        positions: Tensor,
+        bone_scale: Tensor | None,  # noqa: ARG002 - moves the helpers of a rig that has any
+    ) -> Tensor:
+        """``G B^-1`` (B, T, 3, 4) of every joint that carries skin."""
+        return skinning_transforms(rotations, positions, identity.bind_world)
 
     def _walk(
         self,
@@ -128,13 +149,61 @@ class Animation(torch.nn.Module):
     def _skin(self, rest: Tensor, transforms: Tensor) -> Tensor:
         """Posed vertices (B, v, 3), contiguous, from rest vertices (B or 1, v, 3)."""
         if self.warp_skinning:
-            return self._skin_warp(rest, transforms)
+            return _skin_warp(self.posed_skinning, rest, transforms)
         if len(rest) == 1 and not rest.requires_grad:
-            return self.skinning.shared(rest[0], transforms)
-        return self.skinning(rest.permute(2, 1, 0), transforms, rows=True)
+            return self.posed_skinning.shared(rest[0], transforms)
+        return self.posed_skinning(rest.permute(2, 1, 0), transforms, rows=True)
 
-    def _skin_warp(self, rest: Tensor, transforms: Tensor) -> Tensor:
-        from soma_core.kernels.skinning_wp import skin
 
-        points = rest.expand(len(transforms), -1, 3).contiguous()
-        return skin(points, transforms, self.skinning.weights.csr, self.skinning.weights.transpose)
+class ProceduralAnimation(Animation):
+    """The same, with the skin on the rig's procedural joints as well: what the full model poses with.
+
+    Bodies are still brought to the bind pose by the public joints, where no twist acts.
+
+    Args:
+        rig: a rig with `procedural`.
+    """
+
+    def __init__(
+        self, rig: Rig, *, dtype: torch.dtype, device: torch.device, kernels: Literal["auto", "torch", "warp"]
+    ) -> None:
+        super().__init__(rig, dtype=dtype, device=device, kernels=kernels)
+        assert rig.procedural is not None
+        self.twist = Twist(rig, dtype=dtype, device=device)
+        self.posed_skinning = Skinning(rig.procedural.weights, dtype=dtype, device=device)
+
+    def _skinning_transforms(
+        self, identity: Identity, rotations: Tensor, positions: Tensor, bone_scale: Tensor | None
+    ) -> Tensor:
+        public = skinning_transforms(rotations, positions, identity.bind_world)
+        turns, places = self.twist(identity.bind_world, public[..., :3], positions, bone_scale)
+        bind = self.twist.bind_positions(identity.bind_world)
+        shift = places - (turns @ bind[..., None]).squeeze(-1)
+        return torch.cat((public, torch.cat((turns, shift[..., None]), -1)), 1)
+
+    def helper_transforms(
+        self, identity: Identity, transforms: Tensor, bone_scale: Tensor | None = None
+    ) -> Tensor:
+        """World transforms (B, H, 4, 4) [m] of the procedural joints of posed bodies.
+
+        Args:
+            identity: of batch 1 or B.
+            transforms: (B, J, 4, 4) posed world transforms of the public joints [m].
+            bone_scale: the scale that the bodies were posed with.
+        """
+        bind = identity.bind_world
+        rotations, positions = transforms[..., :3, :3], transforms[..., :3, 3]
+        turns, places = self.twist(bind, rotations @ bind[..., :3, :3].mT, positions, bone_scale)
+        return to_homogeneous(turns @ self.twist.bind_rotations(bind), places)
+
+
+def _moved(rest: Tensor, offsets: Tensor | None) -> Tensor:
+    """Rest vertices with offsets added, where there are any."""
+    return rest if offsets is None else rest + offsets
+
+
+def _skin_warp(skinning: Skinning, rest: Tensor, transforms: Tensor) -> Tensor:
+    from soma_core.kernels.skinning_wp import skin
+
+    points = rest.expand(len(transforms), -1, 3).contiguous()
+    return skin(points, transforms, skinning.weights.csr, skinning.weights.transpose)

@@ -9,6 +9,7 @@ __all__ = [
     "axis_angle_to_matrix",
     "cayley",
     "matrix_to_axis_angle",
+    "matrix_to_quaternion",
     "orthonormality_error",
     "shortest_arc",
     "skew",
@@ -62,11 +63,11 @@ def cayley(vector: Tensor) -> Tensor:
     return eye + factor[..., None, None] * (turn + turn @ turn)
 
 
-def matrix_to_axis_angle(matrix: Tensor) -> Tensor:
-    """Logarithm map of SO(3): matrices (..., 3, 3) -> rotation vectors [rad] (..., 3), angle in [0, pi].
+def matrix_to_quaternion(matrix: Tensor) -> Tensor:
+    """Unit quaternion of a rotation, (..., 3, 3) -> (..., 4) in the order w, x, y, z with w >= 0.
 
-    Goes through the quaternion whose largest component is largest among four candidates, so it is
-    accurate at every angle; at exactly pi one of the two valid axes is returned.
+    Takes the one of four candidates whose own component is largest, so it is accurate at every angle; at
+    exactly half a turn one of the two signs is returned.
     """
     xx, xy, xz, yx, yy, yz, zx, zy, zz = matrix.flatten(-2).unbind(-1)
     entries = (
@@ -79,7 +80,16 @@ def matrix_to_axis_angle(matrix: Tensor) -> Tensor:
     largest = torch.diagonal(candidates, dim1=-2, dim2=-1).argmax(-1)
     quaternion = torch.take_along_dim(candidates, largest[..., None, None], -2).squeeze(-2)
     quaternion = quaternion / quaternion.norm(dim=-1, keepdim=True)
-    quaternion = torch.where(quaternion[..., :1] < 0, -quaternion, quaternion)
+    return torch.where(quaternion[..., :1] < 0, -quaternion, quaternion)
+
+
+def matrix_to_axis_angle(matrix: Tensor) -> Tensor:
+    """Logarithm map of SO(3): matrices (..., 3, 3) -> rotation vectors [rad] (..., 3), angle in [0, pi].
+
+    Goes through :func:`matrix_to_quaternion`, so it is accurate at every angle; at exactly pi one of the
+    two valid axes is returned.
+    """
+    quaternion = matrix_to_quaternion(matrix)
     scalar, vector = quaternion[..., 0], quaternion[..., 1:]
     squared = (vector * vector).sum(-1)
     small = squared < _SERIES_BELOW.get(matrix.dtype, 1e-4)

@@ -125,7 +125,7 @@ def register(
     """
     options = options or WrapOptions()
     skin = find_skin(vertices, triangles, masked=options.masked)
-    coarse, fine = (BodyModel(SomaLayer("soma", lod=lod)) for lod in ("low", "mid"))
+    coarse, fine = (BodyModel(SomaLayer("soma", lod=lod, procedural=False)) for lod in ("low", "mid"))
     marks = _landmarks(options, vertices, fine.mesh.vertex_count)
     filled = _filled(options.fill, fine.mesh)
     fit, frame = _fit_best(skin, coarse, options, marks)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,11 +12,14 @@ import scipy.sparse
 from soma_core.cache import cached_arrays, content_key
 from soma_core.errors import AssetError, InputError
 from soma_core.paths import assets_dir
+from soma_core.rig.expansion import expand_rig
 from soma_core.rig.manifest import NEUTRAL_NAME, RIG_NAME, Manifest, read_manifest, verified_sha256
 from soma_core.rig.mesh import CanonicalMesh, Lod
 from soma_core.rig.neutral import SEGMENT_NAMES, read_topology
+from soma_core.rig.procedural_json import parse_procedural
 from soma_core.rig.revision import lod_revision
 from soma_core.rig.skeleton import Rig
+from soma_core.rig.twist_template import procedural_document
 
 __all__ = ["load_canonical"]
 
@@ -124,4 +128,5 @@ def _assemble(arrays: Mapping[str, np.ndarray], lod: Lod, revision: str) -> tupl
         weights=scipy.sparse.csr_array(sparse, shape=(len(arrays["bind_shape"]), len(names))),
         revision=revision,
     )
-    return mesh, rig
+    definition = parse_procedural(procedural_document(names), Path("built in"))
+    return mesh, replace(rig, procedural=expand_rig(rig, definition))

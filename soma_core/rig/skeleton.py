@@ -7,6 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.sparse
 
+from soma_core.rig.procedural import ProceduralRig
+
 __all__ = ["Rig"]
 
 
@@ -23,6 +25,8 @@ class Rig:
         bind_shape: (v, 3) float64 [m].
         weights: (v, J) scipy CSR float64, rows sum to 1, every non-zero influence kept.
         revision: first 16 hex digits of the rig hash (with ``-low`` for a derived LOD).
+        procedural: twist joints that no pose controls, where the rig has any; the fields above are those
+            of the rig without them.
     """
 
     joint_names: tuple[str, ...]
@@ -32,6 +36,7 @@ class Rig:
     bind_shape: np.ndarray
     weights: scipy.sparse.csr_array
     revision: str
+    procedural: ProceduralRig | None = None
 
     @property
     def joint_count(self) -> int:

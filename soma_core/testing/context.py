@@ -220,10 +220,10 @@ class Context:
 
     @functools.cached_property
     def layer(self) -> SomaLayer:
-        """The forward path, transferred vertex by vertex."""
+        """The forward path, transferred vertex by vertex, on the public joints alone."""
         return SomaLayer(
             self.name, options=self.options, dtype=torch.float64, kernels="torch", exact=True,
-            canonical=self._canonical, registry=self.registry,
+            procedural=False, canonical=self._canonical, registry=self.registry,
         )  # fmt: skip
 
     @functools.cached_property

@@ -30,7 +30,7 @@ def configured(**changes):
 
 @pytest.fixture(scope="module")
 def layer():
-    return SomaLayer("soma")
+    return SomaLayer("soma", procedural=False)
 
 
 @pytest.fixture(scope="module")

@@ -223,7 +223,7 @@ def test_a_frame_that_is_no_number_harms_no_other():
 
 @pytest.fixture(scope="module")
 def layer():
-    return SomaLayer("soma", lod="low")
+    return SomaLayer("soma", lod="low", procedural=False)
 
 
 @pytest.mark.parametrize(

@@ -29,7 +29,7 @@ PI = np.pi
 
 @pytest.fixture(scope="module")
 def layer():
-    return SomaLayer("soma", lod="low")
+    return SomaLayer("soma", lod="low", procedural=False)
 
 
 @pytest.fixture(scope="module")
@@ -126,7 +126,7 @@ def test_our_own_bodies_are_met(layer, identity, inversion, fitted, motion):
 def test_under_noise_the_residual_is_the_least_possible(layer, identity, inversion, targets):
     """Against a solve in float64 that has converged to rounding."""
     noisy = targets + NOISE_M * randn(*targets.shape, seed=4, dtype=torch.float32)
-    exact = SomaLayer("soma", lod="low", dtype=torch.float64)
+    exact = SomaLayer("soma", lod="low", dtype=torch.float64, procedural=False)
     who = exact.identity({"shape": identity.params["shape"].double()})
     best = PoseInversion(exact, iterations=60, tolerance=1e-9)(noisy.double(), who)
     assert best.converged.all()
@@ -633,7 +633,7 @@ def test_identities_that_do_not_fit_are_refused(layer, inversion, targets, ident
     mid = SomaLayer("soma", lod="mid").identity()
     with pytest.raises(InputError, match=r"identity: got 18056 vertices on rig \w+, expected 4505"):
         inversion(targets[:3], mid)
-    double = SomaLayer("soma", lod="low", dtype=torch.float64).identity()
+    double = SomaLayer("soma", lod="low", dtype=torch.float64, procedural=False).identity()
     with pytest.raises(InputError, match=r"identity: got torch.float64, expected torch.float32"):
         inversion(targets[:3], double)
     with pytest.raises(InputError, match=r"initial: got 12 frames, expected 3 frames"):

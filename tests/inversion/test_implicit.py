@@ -16,7 +16,7 @@ AGREES = 1e-4
 
 @pytest.fixture(scope="module")
 def layer():
-    return SomaLayer("soma", lod="low", dtype=torch.float64)
+    return SomaLayer("soma", lod="low", dtype=torch.float64, procedural=False)
 
 
 @pytest.fixture(scope="module")

@@ -13,7 +13,7 @@ FRAMES = 3
 
 @pytest.fixture(scope="module")
 def layer():
-    return SomaLayer("soma", lod="low")
+    return SomaLayer("soma", lod="low", procedural=False)
 
 
 @pytest.fixture(scope="module")

@@ -62,7 +62,7 @@ def test_a_rigid_motion_of_the_template_turns_the_hips_alone(make):
 
 def test_each_identity_brings_its_own_bones():
     """Bodies of other proportions, posed at random, one identity a frame: as each alone."""
-    layer = SomaLayer("soma", lod="low", dtype=torch.float64)
+    layer = SomaLayer("soma", lod="low", dtype=torch.float64, procedural=False)
     body, identity = real(), layer.identity({"shape": 0.8 * randn(2, 128, seed=2)})
     rotations, hips = body.poses(2, spread=0.2)
     vertices = layer.pose(identity, rotations, hips).vertices
@@ -74,7 +74,7 @@ def test_each_identity_brings_its_own_bones():
 
 
 def test_a_posed_body_is_met_better_than_by_its_points_alone():
-    layer = SomaLayer("soma", lod="low")
+    layer = SomaLayer("soma", lod="low", procedural=False)
     identity = layer.identity()
     rotations, hips = real().poses(16, spread=0.2, dtype=torch.float32)
     vertices = layer.pose(identity, rotations, hips).vertices
@@ -131,7 +131,7 @@ def test_a_vertex_that_locates_joints_must_have_weight():
 
 
 def test_the_default_weights_serve_and_the_advice_of_the_error_helps():
-    layer = SomaLayer("soma", lod="low")
+    layer = SomaLayer("soma", lod="low", procedural=False)
     identity = layer.identity()
     vertices = layer.pose(identity, *real().poses(2, dtype=torch.float32)).vertices
     weights = real().plain_weights(torch.float32)[0].clone()

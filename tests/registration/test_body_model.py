@@ -18,7 +18,7 @@ SETTLED_MM = 5.0  # after the seven steps of the rough fit, from 140 mm away
 
 @pytest.fixture(scope="module")
 def model() -> BodyModel:
-    return BodyModel(SomaLayer("soma", lod="low"))
+    return BodyModel(SomaLayer("soma", lod="low", procedural=False))
 
 
 def test_the_end_of_the_way_is_the_bind_pose(model: BodyModel) -> None:

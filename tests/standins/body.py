@@ -42,7 +42,9 @@ class Body:
 def make_body(count: int, face_count: int, components: int = 16) -> Body:
     """Make a body of `count` vertices and `face_count` faces; the last faces go where there are too many."""
     low = count < 18056
-    layer = SomaLayer("soma", lod="low" if low else "mid", dtype=torch.float64, kernels="torch")
+    layer = SomaLayer(
+        "soma", lod="low" if low else "mid", dtype=torch.float64, kernels="torch", procedural=False
+    )
     coefficients = torch.zeros(components + 1, 128, dtype=torch.float64)
     coefficients[1:, :components] = torch.eye(components, dtype=torch.float64)
     still = torch.zeros(1, len(layer.joint_names), 3, dtype=torch.float64)
@@ -77,7 +79,7 @@ def make_body(count: int, face_count: int, components: int = 16) -> Body:
 
 def write_wrap(folder: Path, body: Body, scale: float = 1.0) -> None:
     """Write ``SOMA_wrap.obj``: the canonical mid mesh on the facets of the body, its bags apart."""
-    layer = SomaLayer("soma", dtype=torch.float64, kernels="torch")
+    layer = SomaLayer("soma", dtype=torch.float64, kernels="torch", procedural=False)
     with torch.no_grad():
         still = torch.zeros(1, len(layer.joint_names), 3, dtype=torch.float64)
         ideal = layer.pose(layer.identity(), still).vertices[0].numpy()

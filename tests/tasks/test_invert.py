@@ -35,7 +35,7 @@ def configured(**changes):
 
 @pytest.fixture(scope="module")
 def layer():
-    return SomaLayer("soma", lod="low")
+    return SomaLayer("soma", lod="low", procedural=False)
 
 
 @pytest.fixture(scope="module")

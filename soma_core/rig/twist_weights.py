@@ -1,0 +1,101 @@
+"""Skin weights of twist segments spread over their helpers along the bone (paper, section 3.5.1)."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+
+import numpy as np
+import scipy.sparse
+
+from soma_core.rig.procedural import ProceduralDefinition
+
+__all__ = ["fold_weights", "spread_weights"]
+
+_SMOOTHING = 0.06
+"""Half width, as a share of the bone, over which the hat functions of the helpers are averaged: removes
+the creases that piecewise linear weights leave at each helper, and reaches few vertices more."""
+
+_LEAST = 0.002
+"""Shares below this are dropped: at a twist of 150 degrees they move skin by less than 0.1 mm."""
+
+_SIGNIFICAND = 24  # bits of a float32, the implicit one included
+
+
+def _ramp_integral(position: np.ndarray, low: float, high: float) -> np.ndarray:
+    """Integral from minus infinity of the ramp that rises from 0 at `low` to 1 at `high`."""
+    inside = np.clip(position - low, 0, high - low)
+    return 0.5 * inside**2 / (high - low) + np.maximum(position - high, 0)
+
+
+def _shares(position: np.ndarray, nodes: Sequence[float]) -> np.ndarray:
+    """Share (n, k) of each node in skin at `position` along the bone: smoothed hats that sum to 1."""
+    passed = [np.ones_like(position)]
+    for low, high in itertools.pairwise(nodes):
+        ends = (position - _SMOOTHING, position + _SMOOTHING)
+        before, after = (_ramp_integral(end, low, high) for end in ends)
+        passed.append((after - before) / (2 * _SMOOTHING))
+    passed.append(np.zeros_like(position))
+    shares = -np.diff(np.stack(passed, 1), axis=1)
+    shares[shares < _LEAST] = 0
+    return shares / shares.sum(axis=1, keepdims=True)
+
+
+def _exact_parts(weights: np.ndarray, shares: np.ndarray) -> np.ndarray:
+    """Parts (n, k) of float32 weights (n,) in the given shares, each a float32, with an exact sum.
+
+    All are whole multiples of the last digit of the weight, so that no addition rounds.
+    """
+    digit = np.ldexp(1.0, np.frexp(weights)[1] - _SIGNIFICAND)[:, None]
+    parts = np.rint(weights[:, None] * shares / digit) * digit
+    rows = np.arange(len(parts))
+    parts[rows, parts.argmax(axis=1)] += weights - parts.sum(axis=1)
+    return parts
+
+
+def spread_weights(
+    weights: scipy.sparse.csr_array,
+    points: np.ndarray,
+    joints: np.ndarray,
+    definition: ProceduralDefinition,
+) -> scipy.sparse.csr_array:
+    """Spread the weights of each segment's start joint over its helpers, by position along the bone.
+
+    At a helper's own place most of the weight is the helper's, between two it passes smoothly from one
+    to the other, and beyond the last it stays there. The start joint itself keeps a share only where
+    the twist begins with it (a segment that is not reversed).
+
+    Args:
+        weights: (v, J) of the public joints, float32 values.
+        points: (v, 3) bind vertices.
+        joints: (J, 3) bind positions of the public joints, in the same unit.
+        definition: its `main_joints` name the columns.
+
+    Returns:
+        (v, J + H) float64, every value a float32; :func:`fold_weights` gives `weights` back exactly.
+    """
+    names, helpers = definition.main_joints, definition.helpers
+    place = definition.place(names)
+    dense = weights.toarray()
+    full = np.concatenate([dense, np.zeros((len(points), len(helpers)))], axis=1)
+    for segment in definition.segments:
+        start, end = names.index(segment.start), names.index(segment.end)
+        rows = [helpers.index(helper) for helper in segment.helpers]
+        nodes, columns = place[rows, end].tolist(), [len(names) + row for row in rows]
+        if not segment.reverse:
+            nodes, columns = [0.0, *nodes], [start, *columns]
+        used = np.flatnonzero(dense[:, start])
+        bone = joints[end] - joints[start]
+        position = (points[used] - joints[start]) @ bone / (bone @ bone)
+        parts = _exact_parts(dense[used, start], _shares(position, nodes))
+        full[used, start] = 0
+        full[used[:, None], columns] = parts
+    return scipy.sparse.csr_array(full)
+
+
+def fold_weights(weights: scipy.sparse.csr_array, target: np.ndarray, count: int) -> scipy.sparse.csr_array:
+    """Add each column of skin weights (v, n) to its target column: (v, count)."""
+    moves = (np.ones(len(target)), (np.arange(len(target)), target))
+    folded = scipy.sparse.csr_array(weights @ scipy.sparse.csr_array(moves, shape=(len(target), count)))
+    folded.sort_indices()
+    return folded
