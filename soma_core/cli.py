@@ -55,6 +55,9 @@ TASKS = {
     "invert": TaskRow(
         module="invert", summary="find the pose of every frame of a moving mesh, errors in millimetres"
     ),
+    "convert": TaskRow(
+        module="convert", summary="bring motions of AMASS, kimodo and other tools to this skeleton"
+    ),
     "wrap": TaskRow(module="wrap", summary="lay the canonical mesh on any human mesh: an OBJ pair, a report"),
     "train-shape": TaskRow(
         module="train_shape", summary="learn the native shape space from installed backends"

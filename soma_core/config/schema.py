@@ -15,6 +15,8 @@ __all__ = [
     "AutogradChoice",
     "BackendChoice",
     "BenchConfig",
+    "BodyGender",
+    "ConvertConfig",
     "EvaluateConfig",
     "Experiment",
     "FrameRange",
@@ -37,6 +39,14 @@ __all__ = [
     "WrapConfig",
     "register_schemas",
 ]
+
+
+class BodyGender(StrEnum):
+    """Which of a user's SMPL models a motion is posed with."""
+
+    neutral = "neutral"
+    male = "male"
+    female = "female"
 
 
 class Gallery(StrEnum):
@@ -239,6 +249,25 @@ class InvertConfig:
 
 
 @dataclass
+class ConvertConfig:
+    """Configuration of ``soma convert``."""
+
+    inversion: InversionChoice = field(default_factory=InversionChoice)
+    input: str | None = None
+    out: str = MISSING
+    fps: float | None = None
+    unit: LengthUnit | None = None
+    up: Upward | None = None
+    gender: BodyGender | None = None
+    betas: int | None = None
+    lod: Lod = Lod.mid
+    device: str = "cpu"
+    seed: int = 0
+    chunk: int = 256
+    picture: Picture = field(default_factory=lambda: Picture(frames=5))
+
+
+@dataclass
 class TrainShapeConfig:
     """Configuration of ``soma train-shape``."""
 
@@ -312,6 +341,7 @@ def register_schemas() -> None:
     for task, schema in (
         ("animate", AnimateConfig),
         ("invert", InvertConfig),
+        ("convert", ConvertConfig),
         ("train_shape", TrainShapeConfig),
         ("evaluate", EvaluateConfig),
         ("bench", BenchConfig),

@@ -1,0 +1,140 @@
+"""``soma convert``: motions of other tools to this skeleton, one file or a folder of them."""
+
+from __future__ import annotations
+
+import json
+import logging
+from collections import Counter
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from soma_core.cache import atomic_write
+from soma_core.errors import AssetError, InputError, SomaError
+from soma_core.progress import progress
+from soma_core.tasks.convert_file import SUFFIXES, Converter, layout_of
+from soma_core.tasks.fit_job import ResultFiles
+
+if TYPE_CHECKING:
+    from omegaconf import DictConfig
+
+__all__ = ["run"]
+
+_log = logging.getLogger(__name__)
+
+_FAILED, _SKIPPED = "failed", "skipped"
+
+
+def run(config: DictConfig, output: Path) -> None:
+    """Convert ``config.input``.
+
+    A file gives motion.npz and report.json in `output`, and frames.npz and errors.png where a body was
+    fitted. A folder is mirrored: ``motions`` and ``reports`` hold a file for each of its files, and
+    report.json lists them all. What is there already from a run with the same settings is not done again.
+
+    Raises:
+        SomaError: the input, or the backend that it needs, cannot be used; in a folder, after the others.
+    """
+    path = _input(config)
+    try:
+        if path.is_dir():
+            _convert_folder(config, path, output)
+        else:
+            document = Converter(config)(path, ResultFiles.of_folder(output), output / "chunks")
+            _log.info("%s: %s", path.name, _summary(document))
+    except KeyboardInterrupt:
+        _log.warning("stopped; the same command with out=%s goes on from here", output)
+        raise
+
+
+def _input(config: DictConfig) -> Path:
+    if config.chunk < 1:
+        raise InputError("chunk", got=config.chunk, expected="at least 1", fix="Try chunk=256.")
+    if not config.input:
+        raise InputError(
+            "input", got="none", expected="a motion file, or a folder of them", fix="Pass input=FILE."
+        )
+    path = Path(config.input).expanduser()
+    if not path.exists():
+        raise AssetError(path, cause="file is missing", fix="Check the path.")
+    return path
+
+
+def _convert_folder(config: DictConfig, folder: Path, output: Path) -> None:
+    """Convert every file in a folder; those that cannot be are left out and listed."""
+    files = [file for file in _files(folder) if not file.is_relative_to(output.resolve())]
+    if not files:
+        raise InputError(
+            str(folder),
+            got=f"no file ending in {' or '.join(SUFFIXES)}",
+            expected="motion files, at any depth",
+            fix="Name the folder that holds them.",
+        )
+    convert, rows, errors = Converter(config), {}, []
+    for file in progress(files, label="file", total=len(files), after=5.0):
+        name = file.relative_to(folder.resolve()).as_posix()
+        rows[name] = _row(convert, file, output, name, errors)
+        _write_rows(output / "report.json", folder, rows)
+    counts = Counter(row["state"] for row in rows.values())
+    _log.info("%s: %s", folder, ", ".join(f"{count} {state}" for state, count in counts.items()))
+    if not counts[_FAILED]:
+        return
+    if len(errors) == counts.total():
+        raise errors[0]
+    report, failed = output / "report.json", f"{counts[_FAILED]} of {counts.total()} files"
+    raise SomaError(f"{failed} could not be converted, {report} lists them. The first: {errors[0]}")
+
+
+def _files(folder: Path) -> Iterator[Path]:
+    """Files that may hold a motion, hidden ones apart, in the order of their names."""
+    for file in sorted(folder.resolve().rglob("*")):
+        hidden = any(part.startswith(".") for part in file.relative_to(folder.resolve()).parts)
+        if file.suffix.lower() in SUFFIXES and not hidden and file.is_file():
+            yield file
+
+
+def _row(convert: Converter, file: Path, output: Path, name: str, errors: list[SomaError]) -> dict[str, Any]:
+    """Convert one file of a folder; what becomes of it is one row of the report."""
+    try:
+        if layout_of(file) is None:
+            return {"state": _SKIPPED, "reason": "holds no motion"}
+        document = convert(file, _mirrored(output, name), output / "chunks" / name)
+    except SomaError as error:
+        _log.warning("%s: %s", name, error)
+        errors.append(error)
+        return {"state": _FAILED, "reason": str(error)}
+    _log.info("%s: %s", name, _summary(document))
+    error_mm = document.get("error_mm", {}).get("all")
+    return {"state": "converted", "layout": document["settings"]["layout"], "frames": document["frames"],
+            "fps": document["settings"]["fps"], "error_mm": error_mm}  # fmt: skip
+
+
+def _mirrored(output: Path, name: str) -> ResultFiles:
+    """Where the results of the file `name` of a folder go."""
+    motion = output / "motions" / name
+    if motion.suffix.lower() != ".npz":
+        motion = motion.with_name(f"{motion.name}.npz")
+    report = output / "reports" / name
+    return ResultFiles(
+        motion=motion,
+        frames=report.with_suffix(".frames.npz"),
+        report=report.with_suffix(".json"),
+        picture=report.with_suffix(".png"),
+    )
+
+
+def _summary(document: dict[str, Any]) -> str:
+    """One line about a converted file."""
+    settings, error = document["settings"], document.get("error_mm", {}).get("all")
+    told = f"{document['frames']} frames at {settings['fps']:g} fps, {settings['layout']}"
+    if error is None:
+        return f"{told}, rotations carried over"
+    if error["mean"] is None:
+        return f"{told}, no frame could be used"
+    return f"{told}, error mean {error['mean']:.3g}, P95 {error['p95']:.3g}, max {error['max']:.3g} mm"
+
+
+def _write_rows(path: Path, folder: Path, rows: dict[str, Any]) -> None:
+    document = {"input": str(folder.resolve()), "files": rows}
+    text = json.dumps(document, indent=2) + "\n"
+    atomic_write(path, lambda temporary: temporary.write_text(text, encoding="utf-8") and None)
