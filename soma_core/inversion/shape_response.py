@@ -14,7 +14,7 @@ from soma_core.skeleton.identity import Identity
 
 __all__ = ["shape_normal_equations"]
 
-_DAMPING = 1e-4
+_DAMPING = 1e-5
 """Of the poses, relative to the diagonal: keeps what hardly turns anything from following at any cost."""
 
 _RIDGE = 1e-6
