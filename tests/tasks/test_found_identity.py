@@ -43,7 +43,7 @@ def lean(monkeypatch):
 
 @pytest.fixture
 def source(lean, tmp_path):
-    layer = SomaLayer("lean", lod="low")
+    layer = SomaLayer("lean", lod="low", procedural=False)
     turns, hips = 0.25 * randn(FRAMES, 77, 3, seed=1).float(), 0.3 * randn(FRAMES, 3, seed=2).float()
     with torch.no_grad():
         vertices = layer.pose(layer.identity({"shape": TRUTH}), turns, hips).vertices
@@ -66,7 +66,7 @@ def animated(folder, frames):
     )  # fmt: skip
     animate.run(config, folder / "again")
     motion = read_motion(folder / "again/motion.npz")
-    layer = SomaLayer(motion.identity["backend"], lod="low")
+    layer = SomaLayer(motion.identity["backend"], lod="low", procedural=False)
     with torch.no_grad():
         body = animate.stored_identity(layer, motion.identity)
         result = animate.animate(layer, body, motion, translation="motion", keep=list(range(frames)))
