@@ -8,22 +8,13 @@ KNOWN_BACKENDS = {
     "anny": "soma-backend-anny",
     "garment": "soma-backend-garment",
     "mhr": "soma-backend-mhr",
+    "mhr_lod6": "soma-backend-mhr",
     "smpl": "soma-backend-smpl",
     "smplh": "soma-backend-smpl",
     "smplx": "soma-backend-smpl",
     "toy": "soma-backend-toy",
 }
-"""Backend name -> the distribution that provides it, or will: none is published on an index yet."""
-
-_IN_CHECKOUT = {
-    "anny": "./plugins/anny",
-    "garment": "./plugins/garment",
-    "smpl": "./plugins/smpl",
-    "smplh": "./plugins/smpl",
-    "smplx": "./plugins/smpl",
-    "toy": "./plugins/toy",
-}
-"""Backend name -> its folder in this repository."""
+"""Backend name -> the distribution that provides it: none is published on an index yet."""
 
 
 def install_line(name: str) -> str | None:
@@ -34,6 +25,6 @@ def install_line(name: str) -> str | None:
 
 def publication(name: str) -> str:
     """Return what to know before the pip line of a known backend is run: where the package is today."""
-    folder = _IN_CHECKOUT.get(name)
-    where = f"; from a checkout: pip install {folder}" if folder else ""
-    return f"{KNOWN_BACKENDS[name]} is not published yet{where}"
+    distribution = KNOWN_BACKENDS[name]
+    folder = f"./plugins/{distribution.removeprefix('soma-backend-')}"
+    return f"{distribution} is not published yet; from a checkout: pip install {folder}"

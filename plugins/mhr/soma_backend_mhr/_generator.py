@@ -1,0 +1,85 @@
+"""The generator: the user's file, given identity, scales and bone lengths; and posed by its own rig."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import torch
+from torch import Tensor
+
+from soma_backend_mhr._files import EXPRESSIONS
+from soma_backend_mhr._model_file import Model
+from soma_core.errors import InputError
+
+__all__ = ["BONE_LENGTHS", "POSE", "SCALES", "MhrGenerator"]
+
+POSE, BONE_LENGTHS, SCALES = 130, 6, 68
+"""The 204 model parameters in their order: pose, bone lengths, scales."""
+
+
+class MhrGenerator:
+    """MHR; centimetres, +Y up, facing +Z, in the A-pose that its zero is.
+
+    Args:
+        model: the loaded file.
+        device: where it was loaded to.
+    """
+
+    def __init__(self, model: Model, device: torch.device) -> None:
+        self._model, self._device = model, device
+
+    def rest(self, params: Mapping[str, Tensor]) -> Tensor:
+        """Vertices (batch, v, 3) [cm] at pose zero, without expression."""
+        still = params["identity"].new_zeros(len(params["identity"]), POSE)
+        return self._evaluate(params, still, still.new_zeros(len(still), EXPRESSIONS))
+
+    def posed(self, params: Mapping[str, Tensor], pose: Mapping[str, Tensor]) -> Tensor:
+        """Vertices (batch, v, 3) [cm] posed by the model's own skeleton, skinning and pose correctives.
+
+        Args:
+            params: as for :meth:`rest`; a batch of 1 is shared by all poses.
+            pose: ``parameters`` (batch, 130), the first of the model parameters: root translation in units
+                of 10 cm, root Euler angles xyz and joint angles [rad]; ``expression`` (batch, 72), default
+                zero. The model parameters of SAM 3D Body are these, then ``bone_lengths`` (6) and
+                ``scales`` (68) of `params`.
+
+        Raises:
+            InputError: another key or shape, or batches that do not agree.
+        """
+        _check_pose(pose)
+        parameters = pose["parameters"]
+        expression = pose.get("expression", parameters.new_zeros(1, EXPRESSIONS))
+        sizes = {len(params["identity"]), len(parameters), len(expression)} - {1}
+        if len(sizes) > 1:
+            raise InputError(
+                "pose",
+                got=f"{len(parameters)} poses and {len(expression)} expressions for "
+                f"{len(params['identity'])} bodies",
+                expected="as many of each, or one",
+                fix="Give one pose a body, one pose for all, or one body for all.",
+            )
+        count = max(sizes, default=1)
+        shared = {name: value.expand(count, -1) for name, value in params.items()}
+        return self._evaluate(shared, parameters.expand(count, -1), expression.expand(count, -1))
+
+    def triangles(self) -> Tensor:
+        """Native vertex ids (t, 3)."""
+        return self._model.faces.to(self._device)
+
+    def _evaluate(self, params: Mapping[str, Tensor], pose: Tensor, expression: Tensor) -> Tensor:
+        parameters = torch.cat((pose, params["bone_lengths"], params["scales"]), dim=1)
+        return self._model.evaluate(params["identity"], parameters, expression)
+
+
+def _check_pose(pose: Mapping[str, Tensor]) -> None:
+    widths = {"parameters": POSE, "expression": EXPRESSIONS}
+    strange = [name for name in pose if name not in widths]
+    shapes = {name: tuple(value.shape) for name, value in pose.items()}
+    fits = all(len(shape) == 2 and shape[1] == widths.get(name) for name, shape in shapes.items())
+    if strange or "parameters" not in pose or not fits:
+        raise InputError(
+            "pose",
+            got=", ".join(f"{name} {shape}" for name, shape in shapes.items()) or "nothing",
+            expected=f"parameters (batch, {POSE}), and expression (batch, {EXPRESSIONS}) or none",
+            fix="Of the 204 model parameters give the first 130; the others are bone_lengths and scales.",
+        )

@@ -1,0 +1,28 @@
+"""The backend mhr_lod6: MHR at LOD 6."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+from soma_backend_mhr._backend import build, declare
+from soma_backend_mhr._files import LOD6
+from soma_core.plugin.hookspecs import hookimpl
+from soma_core.plugin.spec import BackendSpec, Generator
+
+if TYPE_CHECKING:
+    import torch
+
+__all__ = ["soma_backend", "soma_generator"]
+
+
+@hookimpl
+def soma_backend() -> BackendSpec:
+    """Declare MHR at LOD 6."""
+    return declare(LOD6)
+
+
+@hookimpl
+def soma_generator(device: torch.device, dtype: torch.dtype, options: Mapping[str, Any]) -> Generator:
+    """Build MHR at LOD 6 from the user's file."""
+    return build(LOD6, device, dtype, options)
