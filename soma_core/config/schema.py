@@ -213,6 +213,7 @@ class InversionChoice:
     tolerance: float = 2e-5
     robust: float | None = None
     robust_rounds: int = 10
+    refreshes: int = 6
     analytical: AnalyticalChoice = field(default_factory=AnalyticalChoice)
     autograd: AutogradChoice = field(default_factory=AutogradChoice)
     priors: PriorChoice = field(default_factory=PriorChoice)
@@ -252,6 +253,8 @@ class InvertConfig:
 class ConvertConfig:
     """Configuration of ``soma convert``."""
 
+    backend: BackendChoice | None = None
+    identity: IdentityChoice = field(default_factory=IdentityChoice)
     inversion: InversionChoice = field(default_factory=InversionChoice)
     input: str | None = None
     out: str = MISSING
@@ -259,7 +262,7 @@ class ConvertConfig:
     unit: LengthUnit | None = None
     up: Upward | None = None
     gender: BodyGender | None = None
-    betas: int | None = None
+    most_betas: int | None = None
     lod: Lod = Lod.mid
     device: str = "cpu"
     seed: int = 0

@@ -40,8 +40,8 @@ def run(config: DictConfig, output: Path) -> None:
         if path.is_dir():
             _convert_folder(config, path, output)
         else:
-            document = Converter(config)(path, ResultFiles.of_folder(output), output / "chunks")
-            _log.info("%s: %s", path.name, _summary(document))
+            converted = Converter(config)(path, ResultFiles.of_folder(output), output / "chunks")
+            _log.info("%s: %s", path.name, converted)
     except KeyboardInterrupt:
         _log.warning("stopped; the same command with out=%s goes on from here", output)
         raise
@@ -98,15 +98,15 @@ def _row(convert: Converter, file: Path, output: Path, name: str, errors: list[S
     try:
         if layout_of(file) is None:
             return {"state": _SKIPPED, "reason": "holds no motion"}
-        document = convert(file, _mirrored(output, name), output / "chunks" / name)
+        converted = convert(file, _mirrored(output, name), output / "chunks" / name)
     except SomaError as error:
         _log.warning("%s: %s", name, error)
         errors.append(error)
         return {"state": _FAILED, "reason": str(error)}
-    _log.info("%s: %s", name, _summary(document))
-    error_mm = document.get("error_mm", {}).get("all")
-    return {"state": "converted", "layout": document["settings"]["layout"], "frames": document["frames"],
-            "fps": document["settings"]["fps"], "error_mm": error_mm}  # fmt: skip
+    _log.info("%s: %s", name, converted)
+    report = converted.report
+    return {"state": "converted", "layout": report["settings"]["layout"], "frames": report["frames"],
+            "fps": report["settings"]["fps"], "error_mm": converted.error_mm}  # fmt: skip
 
 
 def _mirrored(output: Path, name: str) -> ResultFiles:
@@ -121,17 +121,6 @@ def _mirrored(output: Path, name: str) -> ResultFiles:
         report=report.with_suffix(".json"),
         picture=report.with_suffix(".png"),
     )
-
-
-def _summary(document: dict[str, Any]) -> str:
-    """One line about a converted file."""
-    settings, error = document["settings"], document.get("error_mm", {}).get("all")
-    told = f"{document['frames']} frames at {settings['fps']:g} fps, {settings['layout']}"
-    if error is None:
-        return f"{told}, rotations carried over"
-    if error["mean"] is None:
-        return f"{told}, no frame could be used"
-    return f"{told}, error mean {error['mean']:.3g}, P95 {error['p95']:.3g}, max {error['max']:.3g} mm"
 
 
 def _write_rows(path: Path, folder: Path, rows: dict[str, Any]) -> None:

@@ -1,7 +1,8 @@
-"""Motions in a backend's own pose parameters: their vertices, posed by the backend when they are read."""
+"""Bodies to fit as sequences of vertices: posed by their backend when they are read, or held in memory."""
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,27 +19,44 @@ from soma_core.io.vertex_sequence import UpAxis, VertexSequence
 from soma_core.layer import SomaLayer
 from soma_core.plugin.registry import default_registry
 from soma_core.plugin.spec import HasPosed
+from soma_core.rig import load_canonical
+from soma_core.topology.correspondence import load_correspondence
 from soma_core.topology.frames import METRES
+from soma_core.topology.transfer import make_transfer
 
-__all__ = ["FitBackend", "FitBackends", "ModelSequence"]
+__all__ = ["FitBackend", "FitBackends", "HeldSequence", "ModelSequence", "TransferredSequence"]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class FitBackend:
-    """A backend that poses, and the fit on its layer."""
+    """A layer, the fit on it, and the model's own poses."""
 
     layer: SomaLayer
     inversion: PoseInversion
-    generator: HasPosed
 
     def posed(self, params: Mapping[str, Tensor], pose: Mapping[str, Tensor]) -> Tensor:
         """The model's own posed vertices; what goes wrong inside names the backend."""
         with default_registry().isolated(self.layer.backend, "rest"), torch.no_grad():
-            return self.generator.posed(params, pose)
+            return self._generator.posed(params, pose)
+
+    @functools.cached_property
+    def _generator(self) -> HasPosed:
+        layer = self.layer
+        generator = default_registry().generator(
+            layer.backend, device=layer.device, dtype=layer.dtype, options=layer.options
+        )
+        if not isinstance(generator, HasPosed):
+            raise InputError(
+                "backend",
+                got=f"{layer.backend}, whose generator has no posed()",
+                expected="a backend that poses its own model",
+                fix="Pass the posed vertices to soma invert.",
+            )
+        return generator
 
 
 class FitBackends:
-    """Backends with their fits, each made when it is first asked for.
+    """Layers with their fits, each made when it is first asked for.
 
     Args:
         lod, device: of the layers.
@@ -54,22 +72,11 @@ class FitBackends:
 
         Raises:
             BackendError: it is not installed, or a file of its user's is missing.
-            InputError: it cannot pose its own model.
         """
         key = (name, repr(sorted(options.items())))
         if key not in self._made:
             layer = SomaLayer(name, options=options, lod=self._lod, device=self._device)
-            generator = default_registry().generator(
-                name, device=layer.device, dtype=layer.dtype, options=options
-            )
-            if not isinstance(generator, HasPosed):
-                raise InputError(
-                    "backend",
-                    got=f"{name}, whose generator has no posed()",
-                    expected="a backend that poses its own model",
-                    fix="Pass the posed vertices to soma invert.",
-                )
-            self._made[key] = FitBackend(layer=layer, inversion=self._make(layer), generator=generator)
+            self._made[key] = FitBackend(layer=layer, inversion=self._make(layer))
         return self._made[key]
 
 
@@ -110,3 +117,46 @@ class ModelSequence(VertexSequence):
 
     def _read(self, start: int, stop: int) -> np.ndarray:
         return self._posed(start, stop).cpu().numpy()
+
+
+class HeldSequence(VertexSequence):
+    """Vertices (frames, n, 3) [m], +Y up, that a reader gave as one array."""
+
+    def __init__(self, path: Path, vertices: np.ndarray, *, fps: float) -> None:
+        super().__init__(path, len(vertices), vertices.shape[1], fps=fps, metres=1.0, up="+y")
+        self._vertices = vertices
+
+    def _read(self, start: int, stop: int) -> np.ndarray:
+        return np.ascontiguousarray(self._vertices[start:stop])
+
+
+class TransferredSequence(VertexSequence):
+    """Vertices of one backend's topology on the canonical mesh of mid [m], +Y up.
+
+    Nothing of the backend is needed but its wrap pair.
+
+    Args:
+        sequence: the vertices, in metres, +Y up.
+        backend: whose topology they have.
+
+    Raises:
+        BackendError: it is not installed, or its wrap pair is missing or unusable.
+    """
+
+    def __init__(self, sequence: VertexSequence, backend: str) -> None:
+        registry = default_registry()
+        spec = registry.spec(backend)
+        mesh, _ = load_canonical("mid")
+        with registry.isolated(backend, "wrap"):
+            correspondence = None if spec.wrap is None else load_correspondence(spec.wrap, mesh)
+            self._transfer = make_transfer(
+                spec, mesh, correspondence, dtype=torch.float32, device=torch.device("cpu")
+            )
+        self._sequence, self._unit = sequence, METRES[spec.unit]
+        super().__init__(
+            sequence.path, sequence.frame_count, mesh.vertex_count, fps=sequence.fps, metres=1.0, up="+y"
+        )
+
+    def _read(self, start: int, stop: int) -> np.ndarray:
+        native = torch.as_tensor(self._sequence.read(start, stop)).float() / self._unit
+        return self._transfer(native).numpy()

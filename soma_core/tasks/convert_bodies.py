@@ -1,0 +1,190 @@
+"""Bodies that files show in a model of their own: what they are fitted with, and what is known of them."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from omegaconf import OmegaConf
+from scipy.spatial.transform import Rotation
+
+from soma_core.errors import InputError
+from soma_core.io.amass import SmplMotion, read_amass
+from soma_core.io.sam3d import Sam3dFrames, read_sam3d
+from soma_core.plugin.errors import BackendError, BrokenBackendError
+from soma_core.tasks.animate import given_params
+from soma_core.tasks.posed_input import PosedInput
+from soma_core.tasks.posed_model import (
+    FitBackend,
+    FitBackends,
+    HeldSequence,
+    ModelSequence,
+    TransferredSequence,
+)
+
+if TYPE_CHECKING:
+    from omegaconf import DictConfig
+
+    from soma_core.plugin.spec import BackendSpec
+
+__all__ = ["ShownBody", "sam3d_body", "smpl_body"]
+
+_log = logging.getLogger(__name__)
+
+_UPRIGHT = 0.7
+"""Cosine between the mean upward direction of a body and that of its world, where people mostly stand."""
+
+_MHR, _DEFAULT = "mhr", "soma"
+_BONE_LENGTHS, _SCALES = slice(130, 136), slice(136, 204)
+"""Of the model parameters of MHR, those that belong to the body."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class ShownBody:
+    """One body over time, and how to fit it.
+
+    Attributes:
+        backend: layer and fit.
+        posed: the vertices.
+        params: the identity, or where the search for it begins.
+        search: choices of the search for an identity that is not known; empty if it is.
+        facts: what else decides the result, for the report.
+        licence: of the motion.
+    """
+
+    backend: FitBackend
+    posed: PosedInput
+    params: Mapping[str, Any]
+    search: Mapping[str, Any]
+    facts: Mapping[str, Any]
+    licence: str
+
+
+def smpl_body(path: Path, config: DictConfig, backends: FitBackends) -> ShownBody:
+    """The body of an AMASS file: its model, posed with its betas and gender.
+
+    Raises:
+        SomaError: the file cannot be read, or the user's model of that gender is not there.
+    """
+    motion = read_amass(
+        path,
+        fps=config.fps,
+        gender=str(config.gender) if config.gender else None,
+        up=f"+{config.up}" if config.up else None,
+    )
+    _warn_lying(path, motion)
+    backend = backends.get(motion.model, {"gender": motion.gender})
+    params = {"betas": _usable_betas(path, motion, backend.layer.spec, config.most_betas)}
+    pose = {"rotations": motion.rotations, "translation": motion.translation}
+    sequence = ModelSequence(path, backend, params, pose, fps=motion.fps, up=motion.up)
+    return ShownBody(
+        backend=backend,
+        posed=PosedInput(sequence, backend.layer, topology="native"),
+        params=params,
+        search={},
+        facts={"up": motion.up},
+        licence=f"that of {path.name}; body model: {backend.layer.spec.licence}",
+    )
+
+
+def _usable_betas(path: Path, motion: SmplMotion, spec: BackendSpec, most: int | None) -> list[float]:
+    """Shape coefficients for the user's model file, without zeros at the end.
+
+    Raises:
+        InputError: the model file has fewer shape directions.
+    """
+    betas = np.trim_zeros(motion.betas[:most].astype(np.float64), "b")
+    (width,) = spec.params[0].shape
+    if len(betas) > width:
+        raise InputError(
+            f"{path}: betas",
+            got=f"{len(betas)} coefficients",
+            expected=f"at most {width}, as your {spec.name} model has",
+            fix=f"Pass most_betas={width} to leave the others out, or get a model file with more of them.",
+        )
+    return [float(value) for value in betas]
+
+
+def _warn_lying(path: Path, motion: SmplMotion) -> None:
+    """Say so where people stand along another axis than the file's world is taken to have."""
+    upward = Rotation.from_rotvec(motion.rotations[:, 0]).apply([0, 1, 0]).mean(axis=0)
+    other = {"+z": "+y", "+y": "+z"}[motion.up]
+    if upward["xyz".index(other[1])] > _UPRIGHT:
+        _log.warning(
+            "%s: the body stands along %s, but the world is taken to have %s up; if not so, pass up=%s",
+            path.name, other, motion.up, other[1],
+        )  # fmt: skip
+
+
+def sam3d_body(path: Path, config: DictConfig, backends: FitBackends) -> ShownBody:
+    """The body of a SAM 3D Body output: MHR with the file's parameters, or one that is yet to be found.
+
+    Raises:
+        SomaError: the file cannot be read, or the user's MHR model or its wrap pair is not there.
+        InputError: no frame rate, or no parameters in the file.
+    """
+    if config.fps is None:
+        raise InputError(
+            f"{path}: fps", got="none: SAM 3D Body sees pictures", expected="frames per second",
+            fix="Pass fps=30 (or the true rate).",
+        )  # fmt: skip
+    frames = read_sam3d(path)
+    vertices = frames.vertices
+    if frames.placement is not None:
+        vertices = vertices + frames.placement[:, None]
+    sequence = HeldSequence(path, vertices, fps=float(config.fps))
+    known = str(config.identity.method) == "known"
+    backend, params = _known_mhr(frames, config, backends) if known else _sought(config, backends)
+    if known:
+        posed = PosedInput(sequence, backend.layer, topology="native")
+    else:
+        posed = PosedInput(TransferredSequence(sequence, _MHR), backend.layer, topology="canonical")
+    search = {} if known else OmegaConf.to_container(config.identity, resolve=True)
+    return ShownBody(
+        backend=backend, posed=posed, params=params, search=search, facts={"up": "+y"},
+        licence=f"that of {path.name}",
+    )  # fmt: skip
+
+
+def _known_mhr(
+    frames: Sam3dFrames, config: DictConfig, backends: FitBackends
+) -> tuple[FitBackend, dict[str, Any]]:
+    """The user's MHR model, and the body that the file describes."""
+    chosen = config.backend
+    options = given_params(chosen.options) if chosen is not None and chosen.name == _MHR else {}
+    try:
+        return backends.get(_MHR, options), _mhr_params(frames)
+    except BackendError as error:
+        fix = f"{error.fix.rstrip('.')}. Or pass identity=unknown, which needs the wrap pair alone"
+        raise BrokenBackendError(who=error.who, stage=error.stage, cause=error.cause, fix=fix) from error
+
+
+def _sought(config: DictConfig, backends: FitBackends) -> tuple[FitBackend, dict[str, Any]]:
+    """The backend in whose shapes a body is sought, and where the search begins."""
+    chosen = config.backend
+    if chosen is None:
+        return backends.get(_DEFAULT, {}), {}
+    return backends.get(chosen.name, given_params(chosen.options)), given_params(chosen.params)
+
+
+def _mhr_params(frames: Sam3dFrames) -> dict[str, list[float]]:
+    """One body for all frames: the mean of what was seen in each.
+
+    Raises:
+        InputError: outputs of early releases, which lack the model parameters.
+    """
+    missing = [key for key in ("shape_params", "mhr_model_params") if key not in frames.parameters]
+    if missing:
+        raise InputError(
+            f"{frames.path}: {missing[0]}",
+            got="none, as in the first releases of SAM 3D Body",
+            expected="the parameters of the body",
+            fix="Pass identity=unknown to find the body from its vertices.",
+        )
+    shape, model = (frames.parameters[key].astype(np.float64) for key in ("shape_params", "mhr_model_params"))
+    seen = {"identity": shape, "bone_lengths": model[:, _BONE_LENGTHS], "scales": model[:, _SCALES]}
+    return {name: values.mean(axis=0).tolist() for name, values in seen.items()}
