@@ -13,7 +13,7 @@ from soma_core.animation.skinning import skinning_transforms
 from soma_core.inversion.problem import Problem
 from soma_core.skeleton.identity import Identity
 
-__all__ = ["clipped_targets", "compare", "part_of"]
+__all__ = ["compare", "linear_targets", "part_of"]
 
 _POSED_AT_A_TIME = 32
 """Frames posed and compared at a time by the reference, so that they stay in cache."""
@@ -23,51 +23,74 @@ _SAMPLED = 8
 
 
 def compare(
-    animation: Animation, problem: Problem, relative: Tensor, translation: Tensor, *, warp: bool
+    model: Animation, problem: Problem, relative: Tensor, translation: Tensor, *, warp: bool
 ) -> tuple[Tensor, Tensor]:
     """Vertex errors (F, v) [m] and their weighted root mean square (F,) [m].
 
     Args:
-        animation: the forward model.
+        model: the forward model.
         problem: targets, weights and identity.
         relative: user joints' rotations (F, J - 1, 3, 3).
         translation: Hips positions (F, 3) [m], in the world.
-        warp: run the Warp twin where one identity and one set of weights serve all frames.
+        warp: run the Warp twin, which knows linear blend skinning of one identity under one set of weights.
     """
     identity, weights = problem.identity, problem.weights
     if warp and identity.batch_size == 1 and len(weights) == 1:
-        error, total = _by_warp(animation, problem, relative, translation)
+        error, total = _by_warp(model, problem, relative, translation)
     else:
         error = problem.vertices.new_empty(problem.vertices.shape[:2])
-        for chunk, posed in _posed(animation, problem, relative, translation):
+        for chunk, posed in _posed(model, problem, relative, translation):
             step = posed.sub_(problem.vertices[chunk])
             torch.linalg.vector_norm(step, dim=-1, out=error[chunk])
         total = (error * error * weights).sum(1)
     return error, (total / weights.sum(1).clamp_min(torch.finfo(weights.dtype).tiny)).sqrt()
 
 
-def clipped_targets(
-    animation: Animation, problem: Problem, relative: Tensor, translation: Tensor, *, scale: float
-) -> Tensor:
-    """Targets (F, v, 3) [m]; those too far from their posed vertex are brought as near as `scale` [m].
+def linear_targets(
+    linear: Animation,
+    model: Animation,
+    problem: Problem,
+    relative: Tensor,
+    translation: Tensor,
+    *,
+    robust: float | None,
+) -> tuple[Tensor, Tensor]:
+    """Targets (F, v, 3) [m] for linear blend skinning, and the energy (F,) [m^2] of the full model.
 
-    Too far is farther than `scale` and than twice the frame's median: a fit that outliers have dragged off
-    finds its way back in few rounds.
+    What the full model adds at this pose, twist and correctives, is taken from the target. With `robust`,
+    vertices too far from their target ask for no more than that length [m]. Too far is farther than
+    `robust` and than twice the frame's median: a fit that outliers have dragged off finds its way back in
+    few rounds.
+
+    Args:
+        linear: skinning by the public joints, which the solver knows.
+        model: the forward model; the same where it adds nothing.
+        problem, relative, translation: as in :func:`compare`.
     """
-    clipped, weights = torch.empty_like(problem.vertices), problem.weights
-    for chunk, posed in _posed(animation, problem, relative, translation):
+    targets, energy = torch.empty_like(problem.vertices), problem.vertices.new_empty(len(relative))
+    skinned = None if linear is model else _posed(linear, problem, relative, translation)
+    for chunk, posed in _posed(model, problem, relative, translation):
         step = problem.vertices[chunk] - posed
-        length = torch.linalg.vector_norm(step, dim=-1)
-        counted = (weights[chunk] if len(weights) > 1 else weights)[:, ::_SAMPLED] > 0
-        typical = length[:, ::_SAMPLED].masked_fill(~counted, torch.nan).nanmedian(1, keepdim=True).values
-        bound = (2 * typical.nan_to_num(0.0)).clamp_min(scale)
-        share = bound / torch.maximum(length, bound)
-        torch.addcmul(posed, step, share[..., None], out=clipped[chunk])
-    return clipped
+        weights = problem.weights[chunk] if len(problem.weights) > 1 else problem.weights
+        energy[chunk] = ((step * step).sum(-1) * weights).sum(-1)
+        if robust is not None:
+            step *= _share(step, weights, robust)[..., None]
+        base = posed if skinned is None else next(skinned)[1]
+        torch.add(base, step, out=targets[chunk])
+    return targets, energy
+
+
+def _share(step: Tensor, weights: Tensor, robust: float) -> Tensor:
+    """(F, v) the share of residuals (F, v, 3) that counts, 1 or less."""
+    length = torch.linalg.vector_norm(step, dim=-1)
+    counted = weights[:, ::_SAMPLED] > 0
+    typical = length[:, ::_SAMPLED].masked_fill(~counted, torch.nan).nanmedian(1, keepdim=True).values
+    bound = (2 * typical.nan_to_num(0.0)).clamp_min(robust)
+    return bound / torch.maximum(length, bound)
 
 
 def _posed(
-    animation: Animation, problem: Problem, relative: Tensor, translation: Tensor
+    model: Animation, problem: Problem, relative: Tensor, translation: Tensor
 ) -> Iterator[tuple[slice, Tensor]]:
     """Reconstruction of a few frames at a time."""
     for first in range(0, len(relative), _POSED_AT_A_TIME):
@@ -75,7 +98,7 @@ def _posed(
         scale, who = problem.bone_scale, part_of(problem.identity, chunk)
         scale = scale[chunk] if scale is not None and len(scale) > 1 else scale
         turns, places = relative[chunk], translation[chunk]
-        yield chunk, animation.pose(who, turns, places, absolute=False, bone_scale=scale).vertices
+        yield chunk, model.pose(who, turns, places, absolute=False, bone_scale=scale).vertices
 
 
 def _by_warp(

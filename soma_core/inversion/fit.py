@@ -80,7 +80,7 @@ class PoseInversion(torch.nn.Module):
         layer: makes identities, and poses them; its LOD is the LOD of the fit.
         kernels: ``torch`` (the reference), ``warp`` or ``auto``.
         priors: joint limits, hinges, a rest pose, smooth motion.
-        stages, iterations, tolerance, analytical, autograd, robust, robust_rounds: see
+        stages, iterations, tolerance, analytical, autograd, robust, robust_rounds, refreshes: see
             :class:`LadderOptions`.
 
     Raises:
@@ -98,13 +98,14 @@ class PoseInversion(torch.nn.Module):
         autograd: AutogradOptions | None = None,
         robust: float | None = None,
         robust_rounds: int = 10,
+        refreshes: int = 6,
         priors: PosePriors | None = None,
         kernels: Kernels = "auto",
     ) -> None:
         super().__init__()
         options = LadderOptions(
             stages=stages, iterations=iterations, tolerance=tolerance, robust=robust,
-            robust_rounds=robust_rounds, analytical=analytical or AnalyticalOptions(),
+            robust_rounds=robust_rounds, refreshes=refreshes, analytical=analytical or AnalyticalOptions(),
             autograd=autograd or AutogradOptions(),
         )  # fmt: skip
         if kernels not in get_args(Kernels):
@@ -114,6 +115,7 @@ class PoseInversion(torch.nn.Module):
         self.layer, self.priors = layer, priors or PosePriors()
         # Not measured on CUDA, where one thread would hold a whole frame: the dense reference runs there.
         self.warp = warp = kernels == "warp" or (kernels == "auto" and layer.device.type == "cpu")
+        self.plain = layer.posing is layer.animation
         structure = moment_structure(layer.mesh, layer.rig)
         kind = {"dtype": layer.dtype, "device": layer.device}
         self.moments = SkinMoments(structure, layer.rig, warp=warp, **kind)
@@ -280,7 +282,9 @@ class PoseInversion(torch.nn.Module):
         pose = self.ladder(problem, start)
         relative = torch.where(usable[:, None, None, None], pose.relative, eye)[:, 1:]
         translation = torch.where(usable[:, None], pose.translation + origin, torch.zeros_like(origin))
-        error, residual = compare(self.layer.animation, problem, relative, translation, warp=self.warp)
+        error, residual = compare(
+            self.layer.posing, problem, relative, translation, warp=self.warp and self.plain
+        )
         error.masked_fill_(~usable[:, None], torch.nan)
         if vertices is not frames.vertices:
             error.masked_fill_(~torch.isfinite(frames.vertices).all(-1), torch.nan)

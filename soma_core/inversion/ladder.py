@@ -12,9 +12,9 @@ from torch import Tensor
 from soma_core.errors import InputError
 from soma_core.inversion.analytical import Analytical, AnalyticalOptions
 from soma_core.inversion.autograd import Autograd, AutogradOptions
-from soma_core.inversion.comparison import clipped_targets
 from soma_core.inversion.gauss_newton import GaussNewton
 from soma_core.inversion.moments import SkinMoments
+from soma_core.inversion.outer import OuterLoop
 from soma_core.inversion.priors import hinge_rotation
 from soma_core.inversion.problem import Pose, Problem
 from soma_core.inversion.regions import body_regions
@@ -44,10 +44,12 @@ class LadderOptions:
         robust: residuals beyond this, and beyond twice the frame's median, count linearly (Huber) [m]; None
             is least squares.
         robust_rounds: how often the residuals are looked at again.
+        refreshes: how often what the full model adds to skinning, twist and correctives, is looked at again;
+            0 ignores it.
 
     Raises:
-        InputError: an unknown stage, a negative number of iterations or tolerance, a robust scale of zero
-            or less.
+        InputError: an unknown stage, a negative number of iterations or refreshes, a negative tolerance, a
+            robust scale of zero or less.
     """
 
     stages: Sequence[Stage] = ("procrustes", "gauss_newton")
@@ -57,6 +59,7 @@ class LadderOptions:
     autograd: AutogradOptions = field(default_factory=AutogradOptions)
     robust: float | None = None
     robust_rounds: int = 10
+    refreshes: int = 6
 
     def __post_init__(self) -> None:
         names = get_args(Stage)
@@ -70,6 +73,8 @@ class LadderOptions:
             raise InputError(
                 "iterations", got=self.iterations, expected="at least 0", fix="Pass iterations=40."
             )
+        if self.refreshes < 0:
+            raise InputError("refreshes", got=self.refreshes, expected="at least 0", fix="Pass refreshes=6.")
         if not self.tolerance >= 0:
             raise InputError(
                 "tolerance", got=self.tolerance, expected="a length [m]", fix="Pass tolerance=5e-5."
@@ -98,7 +103,9 @@ class Ladder(torch.nn.Module):
         warp: bool,
     ) -> None:
         super().__init__()
-        self.animation, self.moments, self.options = layer.animation, moments, options
+        self.moments, self.options = moments, options
+        model = layer.posing if options.refreshes else layer.animation
+        self.outer = OuterLoop(layer.animation, model, moments, robust=options.robust)
         kind = {"dtype": layer.dtype, "device": layer.device}
         self.solver = GaussNewton(structure, warp=warp, **kind)
         self.start = ProcrustesStart(structure, **kind)
@@ -116,10 +123,11 @@ class Ladder(torch.nn.Module):
             if pose is None or stage not in _STARTS:
                 pose = getattr(self, f"_{stage}")(problem, pose)
         assert pose is not None
-        for _ in range(self.options.robust_rounds if self.options.robust is not None else 0):
-            clipped, moved = self._clipped(problem, pose)
-            pose = self._gauss_newton(clipped, moved)
-            pose = replace(pose, translation=pose.translation + clipped.origin - problem.origin)
+        rounds = self.options.robust_rounds if self.options.robust is not None else 0
+        if self.outer.model is not self.outer.linear:
+            rounds = max(rounds, self.options.refreshes)
+        if rounds:
+            pose = self.outer(problem, pose, self._refined, rounds=rounds)
         return pose
 
     def _procrustes(self, problem: Problem, _pose: Pose | None) -> Pose:
@@ -166,20 +174,7 @@ class Ladder(torch.nn.Module):
             problem = replace(problem, weights=weights, rest=rest, target=target)
         return self.autograd(problem, pose)
 
-    def _clipped(self, problem: Problem, pose: Pose) -> tuple[Problem, Pose]:
-        """The least-squares problem that majorises the robust one at a pose, and the pose about its origin.
-
-        Targets farther than the scale are brought to that distance; Huber's loss has unit curvature at
-        most, so that lowering the one lowers the other.
-        """
-        assert self.options.robust is not None
-        relative, translation = pose.relative[:, 1:], pose.translation + problem.origin
-        scale = self.options.robust
-        vertices = clipped_targets(self.animation, problem, relative, translation, scale=scale)
-        if problem.rest.local.numel():
-            target, origin = self.moments.target(vertices, problem.rest)
-        else:
-            offsets = problem.rest.offsets
-            _, target, origin = self.moments.each(vertices, problem.identity, problem.weights, offsets)
-        moved = replace(pose, translation=translation - origin)
-        return replace(problem, vertices=vertices, target=target, origin=origin), moved
+    def _refined(self, problem: Problem, pose: Pose) -> Pose:
+        """The last refining stage, from a pose near its solution; Gauss-Newton where there is none."""
+        refining = [stage for stage in self.options.stages if stage not in _STARTS] or ["gauss_newton"]
+        return getattr(self, f"_{refining[-1]}")(problem, pose)
