@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import logging
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -14,14 +15,19 @@ import scipy.sparse
 from soma_core.cache import atomic_write, file_sha256
 from soma_core.errors import AssetError
 from soma_core.rig.compression import compress_shape_space
-from soma_core.rig.manifest import NEUTRAL_NAME, RIG_NAME, Manifest, write_manifest
+from soma_core.rig.expansion import helper_transforms
+from soma_core.rig.manifest import NEUTRAL_NAME, PROCEDURAL_NAME, RIG_NAME, Manifest, write_manifest
 from soma_core.rig.neutral import SEGMENT_NAMES, ShapeSpace, load_shape_space, write_neutral
+from soma_core.rig.procedural import ProceduralDefinition
+from soma_core.rig.procedural_json import parse_procedural
 from soma_core.rig.revision import REVISION_DIGITS, rig_hash
 from soma_core.rig.segments import RiggedMesh, label_segments
 from soma_core.rig.source import SOURCE_SHA256, SourceRig, read_source
 from soma_core.rig.subdivision import LowMesh, recover_low, split_polygons
 from soma_core.rig.symmetry import mirror_vertices
 from soma_core.rig.transforms import local_transforms, world_transforms
+from soma_core.rig.twist_template import procedural_document
+from soma_core.rig.twist_weights import spread_weights
 from soma_core.rig.usd_text import SkinMeshText, rig_text
 
 __all__ = ["build_assets"]
@@ -41,11 +47,15 @@ _CONTRACT = {
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Built:
-    """Everything derived from the source before any file is written."""
+    """Everything derived from the source before any file is written.
+
+    `weights` (v, J + H) are float32, spread over the helpers of the twist segments.
+    """
 
     source: SourceRig
     low: LowMesh
-    rest_local: np.ndarray
+    definition: ProceduralDefinition
+    weights: np.ndarray
     topology: Mapping[str, np.ndarray]
     rig_hash: str
 
@@ -78,6 +88,9 @@ def _derive(source: SourceRig) -> _Built:
         **{f"segment_{name}": segments[name] for name in SEGMENT_NAMES},
     }
     rest_local = local_transforms(source.t_pose_world, source.parents)
+    definition = parse_procedural(procedural_document(source.joint_names), Path(PROCEDURAL_NAME))
+    weights = scipy.sparse.csr_array(source.weights.astype(np.float32), dtype=np.float64)
+    places = source.bind_world[:, :3, 3]
     digits = rig_hash(
         joint_names=source.joint_names,
         parents=source.parents,
@@ -85,10 +98,17 @@ def _derive(source: SourceRig) -> _Built:
         # Composed again, as every reader of the USD file will: the hash is of the file's values.
         t_pose_world=world_transforms(rest_local, source.parents),
         bind_shape=source.bind_shape,
-        weights=scipy.sparse.csr_array(source.weights),
+        weights=weights,
         triangles=source.triangles,
     )
-    return _Built(source=source, low=low, rest_local=rest_local, topology=topology, rig_hash=digits)
+    return _Built(
+        source=source,
+        low=low,
+        definition=definition,
+        weights=spread_weights(weights, source.bind_shape, places, definition).toarray().astype(np.float32),
+        topology=topology,
+        rig_hash=digits,
+    )
 
 
 def _influences(weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -108,7 +128,7 @@ def _skin(built: _Built, lod: str) -> SkinMeshText:
     if lod == "low":
         used, uv_indices = np.unique(source.uv_quads[built.low.corner_quads, 1], return_inverse=True)
         uv = uv[used]
-    joints, weights = _influences(source.weights)
+    joints, weights = _influences(built.weights)
     return SkinMeshText(
         name="c_skin_mid" if lod == "mid" else "c_skin_lo",
         points=source.bind_shape[:count].astype(np.float32),
@@ -122,15 +142,22 @@ def _skin(built: _Built, lod: str) -> SkinMeshText:
 
 
 def _usda(built: _Built) -> str:
-    source = built.source
+    source, definition = built.source, built.definition
+    starts = [source.joint_names.index(definition.segment_of(helper).start) for helper in definition.helpers]
+    parents = np.concatenate([source.parents, np.array(starts, np.int32)])
+    bind, rest = (
+        np.concatenate([world, helper_transforms(world, definition)])
+        for world in (source.bind_world, source.t_pose_world)
+    )
     return rig_text(
-        joint_names=source.joint_names,
-        parents=source.parents,
-        bind_world=source.bind_world,
-        rest_local=built.rest_local,
+        joint_names=(*source.joint_names, *definition.helpers),
+        parents=parents,
+        bind_world=bind,
+        rest_local=local_transforms(rest, parents),
         meshes=[_skin(built, "mid"), _skin(built, "low")],
         notes={"licence": _LICENCE, "origin": _ORIGIN, "rig_hash": built.rig_hash},
-        comment="Canonical SOMA rig; restTransforms hold the T-pose. Written by soma assets build.",
+        comment="Canonical SOMA rig with its twist joints; restTransforms hold the T-pose. "
+        "Written by soma assets build.",
     )
 
 
@@ -220,6 +247,8 @@ def build_assets(output: Path, shape_space: Path | None = None) -> Manifest:
     space = _shape_space(built, output, shape_space)
     text = _usda(built)
     atomic_write(output / RIG_NAME, lambda temporary: temporary.write_text(text, encoding="utf-8"))
+    definition = json.dumps(procedural_document(built.source.joint_names), indent=1) + "\n"
+    atomic_write(output / PROCEDURAL_NAME, lambda temporary: temporary.write_text(definition, "utf-8"))
     write_neutral(output / NEUTRAL_NAME, built.topology, space, _metadata(built))
     counts = {
         "joints": len(built.source.joint_names),
@@ -230,8 +259,16 @@ def build_assets(output: Path, shape_space: Path | None = None) -> Manifest:
         "faces_low": len(built.low.face_vert_counts),
         "triangles_low": len(built.topology["triangles_low"]),
     }
+    twist = {"twist_joints": len(built.definition.helpers)}
     files = {
-        RIG_NAME: _entry(output / RIG_NAME, counts, built, "cm", _ORIGIN),
+        RIG_NAME: _entry(output / RIG_NAME, {**counts, **twist}, built, "cm", _ORIGIN),
+        PROCEDURAL_NAME: _entry(
+            output / PROCEDURAL_NAME,
+            {"segments": len(built.definition.segments), **twist},
+            built,
+            "cm",
+            "generated by this project",
+        ),
         NEUTRAL_NAME: _entry(
             output / NEUTRAL_NAME, {**counts, "components": space.component_count}, built, "cm", _ORIGIN
         ),

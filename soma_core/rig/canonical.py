@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,18 +11,24 @@ import scipy.sparse
 from soma_core.cache import cached_arrays, content_key
 from soma_core.errors import AssetError, InputError
 from soma_core.paths import assets_dir
-from soma_core.rig.expansion import expand_rig
-from soma_core.rig.manifest import NEUTRAL_NAME, RIG_NAME, Manifest, read_manifest, verified_sha256
+from soma_core.rig.manifest import (
+    NEUTRAL_NAME,
+    PROCEDURAL_NAME,
+    RIG_NAME,
+    Manifest,
+    read_manifest,
+    verified_sha256,
+)
 from soma_core.rig.mesh import CanonicalMesh, Lod
 from soma_core.rig.neutral import SEGMENT_NAMES, read_topology
-from soma_core.rig.procedural_json import parse_procedural
+from soma_core.rig.procedural import ProceduralDefinition, ProceduralRig
+from soma_core.rig.procedural_json import read_procedural
 from soma_core.rig.revision import lod_revision
 from soma_core.rig.skeleton import Rig
-from soma_core.rig.twist_template import procedural_document
 
 __all__ = ["load_canonical"]
 
-_LAYOUT = 1  # raise when the cached arrays change meaning
+_LAYOUT = 2  # raise when the cached arrays change meaning
 _SEGMENT = "segment_"
 
 
@@ -50,16 +55,19 @@ def _mid_topology(topology: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
     return mid | {_SEGMENT + name: topology[_SEGMENT + name] for name in SEGMENT_NAMES}
 
 
-def _parse(root: Path, lod: Lod, manifest: Manifest) -> dict[str, np.ndarray]:
-    """Read both files and flatten what one LOD needs into arrays."""
+def _parse(
+    root: Path, lod: Lod, manifest: Manifest, definition: ProceduralDefinition
+) -> dict[str, np.ndarray]:
+    """Read mesh and rig and flatten what one LOD needs into arrays."""
     from soma_core.rig.usd import read_usd_rig  # imports pxr, needed only without a cache
 
     topology = read_topology(root / NEUTRAL_NAME)
-    found = read_usd_rig(root / RIG_NAME, lod=lod, triangles=topology["triangles"])
+    found = read_usd_rig(root / RIG_NAME, lod=lod, triangles=topology["triangles"], definition=definition)
     if lod == "mid" and found.rig_hash != manifest.rig_hash:
         cause = f"rig revision is {found.rig.revision}, the manifest says {manifest.rig_revision}"
         raise AssetError(root / RIG_NAME, cause=cause, fix="Make the assets again with `soma assets build`")
-    rig = found.rig
+    rig, procedural = found.rig, found.rig.procedural
+    assert procedural is not None
     arrays = _mid_topology(topology) if lod == "mid" else _low_topology(topology)
     return arrays | {
         "joint_names": np.array(rig.joint_names),
@@ -70,6 +78,11 @@ def _parse(root: Path, lod: Lod, manifest: Manifest) -> dict[str, np.ndarray]:
         "weights_data": rig.weights.data,
         "weights_indices": rig.weights.indices,
         "weights_indptr": rig.weights.indptr,
+        "helper_start": procedural.start_joints,
+        "helper_bind_world": procedural.bind_world,
+        "helper_weights_data": procedural.weights.data,
+        "helper_weights_indices": procedural.weights.indices,
+        "helper_weights_indptr": procedural.weights.indptr,
         "face_vert_indices": found.face_vert_indices,
         "face_vert_counts": found.face_vert_counts,
         "uv": found.uv,
@@ -95,15 +108,23 @@ def load_canonical(lod: Lod = "mid", root: Path | str | None = None) -> tuple[Ca
         raise InputError("lod", got=repr(lod), expected="'mid' or 'low'", fix="Choose one of the two.")
     root = assets_dir() if root is None else Path(root)
     manifest = read_manifest(root)
-    sums = [verified_sha256(root, manifest, name) for name in (RIG_NAME, NEUTRAL_NAME)]
+    sums = [verified_sha256(root, manifest, name) for name in (RIG_NAME, NEUTRAL_NAME, PROCEDURAL_NAME)]
+    definition = read_procedural(root / PROCEDURAL_NAME)
     key = content_key(_LAYOUT, lod, manifest.rig_hash, *sums)
-    arrays = cached_arrays("canonical", key, lambda: _parse(root, lod, manifest))
+    arrays = cached_arrays("canonical", key, lambda: _parse(root, lod, manifest, definition))
     for array in arrays.values():
         array.setflags(write=False)
-    return _assemble(arrays, lod, lod_revision(manifest.rig_hash, lod))
+    return _assemble(arrays, lod, lod_revision(manifest.rig_hash, lod), definition)
 
 
-def _assemble(arrays: Mapping[str, np.ndarray], lod: Lod, revision: str) -> tuple[CanonicalMesh, Rig]:
+def _weights(arrays: Mapping[str, np.ndarray], prefix: str, columns: int) -> scipy.sparse.csr_array:
+    parts = tuple(arrays[f"{prefix}_{part}"] for part in ("data", "indices", "indptr"))
+    return scipy.sparse.csr_array(parts, shape=(len(arrays["bind_shape"]), columns))
+
+
+def _assemble(
+    arrays: Mapping[str, np.ndarray], lod: Lod, revision: str, definition: ProceduralDefinition
+) -> tuple[CanonicalMesh, Rig]:
     mesh = CanonicalMesh(
         vertices=arrays["bind_shape"],
         triangles=arrays["triangles"],
@@ -118,15 +139,21 @@ def _assemble(arrays: Mapping[str, np.ndarray], lod: Lod, revision: str) -> tupl
         revision=revision,
     )
     names = tuple(arrays["joint_names"].tolist())
-    sparse = (arrays["weights_data"], arrays["weights_indices"], arrays["weights_indptr"])
+    procedural = ProceduralRig(
+        joint_names=definition.helpers,
+        start_joints=arrays["helper_start"],
+        bind_world=arrays["helper_bind_world"],
+        weights=_weights(arrays, "helper_weights", len(names) + len(definition.helpers)),
+        definition=definition,
+    )
     rig = Rig(
         joint_names=names,
         parents=arrays["parents"],
         bind_world=arrays["bind_world"],
         t_pose_world=arrays["t_pose_world"],
         bind_shape=arrays["bind_shape"],
-        weights=scipy.sparse.csr_array(sparse, shape=(len(arrays["bind_shape"]), len(names))),
+        weights=_weights(arrays, "weights", len(names)),
         revision=revision,
+        procedural=procedural,
     )
-    definition = parse_procedural(procedural_document(names), Path("built in"))
-    return mesh, replace(rig, procedural=expand_rig(rig, definition))
+    return mesh, rig

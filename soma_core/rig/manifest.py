@@ -15,6 +15,7 @@ from soma_core.files import refuse_unreadable
 __all__ = [
     "MANIFEST_NAME",
     "NEUTRAL_NAME",
+    "PROCEDURAL_NAME",
     "RIG_NAME",
     "Manifest",
     "check_files",
@@ -26,6 +27,7 @@ __all__ = [
 MANIFEST_NAME = "MANIFEST.json"
 RIG_NAME = "SOMA_template_rig.usda"
 NEUTRAL_NAME = "SOMA_neutral.npz"
+PROCEDURAL_NAME = "SOMA_procedural_transforms.json"
 
 _SCHEMA = 1
 _RESTORE = "Restore it with `git checkout -- assets`, or make it again with `soma assets build`"

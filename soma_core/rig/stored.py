@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
@@ -13,6 +14,7 @@ from soma_core.errors import AssetError
 from soma_core.rig.revision import REVISION_DIGITS, rig_hash
 from soma_core.rig.skeleton import Rig
 from soma_core.rig.transforms import depth_order, project_rotations
+from soma_core.rig.twist_weights import fold_weights
 
 __all__ = ["ROW_SUM_TOLERANCE", "StoredRig", "refuse_bad_weights"]
 
@@ -77,6 +79,30 @@ class StoredRig:
     weights: scipy.sparse.csr_array
     unit: float = 0.01
     up: Literal["Y", "Z"] = "Y"
+
+    def keep(self, names: Sequence[str]) -> StoredRig:
+        """Reduce the rig to the joints in `names`, all of which it has, in that order.
+
+        Each joint that goes is folded into its nearest kept ancestor (the first kept joint where it has
+        none): its children hang there, and its skin weights are added there.
+        """
+        kept = [self.joint_names.index(name) for name in names]
+        place = np.full(len(self.joint_names), -1)
+        place[kept] = np.arange(len(kept))
+        target = np.zeros(len(self.joint_names), np.int64)
+        parents = np.full(len(self.joint_names), -1)
+        for joint in depth_order(self.parents).tolist():
+            above = int(self.parents[joint])
+            parents[joint] = -1 if above < 0 else (place[above] if place[above] >= 0 else parents[above])
+            target[joint] = place[joint] if place[joint] >= 0 else max(parents[joint], 0)
+        return replace(
+            self,
+            joint_names=tuple(names),
+            parents=parents[kept].astype(np.int32),
+            bind_world=self.bind_world[kept],
+            t_pose_world=self.t_pose_world[kept],
+            weights=fold_weights(self.weights, target, len(kept)),
+        )
 
     def digest(self, triangles: np.ndarray) -> str:
         """Rig hash (64 hex digits) of the values before any processing but their unit, here cm."""

@@ -11,8 +11,10 @@ import numpy as np
 
 from soma_core.errors import AssetError
 from soma_core.files import refuse_unreadable
+from soma_core.rig.expansion import public_rig, with_helpers
 from soma_core.rig.influences import read_weights
 from soma_core.rig.mesh import Lod
+from soma_core.rig.procedural import ProceduralDefinition
 from soma_core.rig.skeleton import Rig
 from soma_core.rig.stored import StoredRig
 from soma_core.rig.transforms import world_transforms
@@ -237,7 +239,12 @@ def _fan_triangles(indices: np.ndarray, counts: np.ndarray) -> np.ndarray:
 
 
 def read_usd_rig(
-    path: Path, *, mesh: str | None = None, lod: Lod = "mid", triangles: np.ndarray | None = None
+    path: Path,
+    *,
+    mesh: str | None = None,
+    lod: Lod = "mid",
+    triangles: np.ndarray | None = None,
+    definition: ProceduralDefinition | None = None,
 ) -> UsdRig:
     """Read a rig from a UsdSkel file, converted to metres and +Y up.
 
@@ -249,10 +256,14 @@ def read_usd_rig(
         mesh: name or path of the skin; default: the usual names of `lod`, else the only skin.
         lod: which names to look for.
         triangles: (t, 3) canonical triangulation for the rig hash; default: fans of the polygons.
+        definition: which joints a pose controls and which are twist joints; the others are folded into
+            their ancestors, and so are the twist joints for all but `Rig.procedural`. The hash is that of
+            the folded rig. Default: every joint is one that a pose controls.
 
     Raises:
         AssetError: unreadable file, unknown mesh, missing restTransforms, unsupported up axis,
-            weights that are negative, not finite, do not sum to 1 or name unknown joints.
+            weights that are negative, not finite, do not sum to 1 or name unknown joints, or a skeleton
+            without a joint of the definition.
     """
     from pxr import UsdGeom
 
@@ -276,9 +287,11 @@ def read_usd_rig(
         unit=float(UsdGeom.GetStageMetersPerUnit(stage)),
         up=up,
     )
-    digest = stored.digest(_fan_triangles(indices, counts) if triangles is None else triangles)
+    public = stored if definition is None else public_rig(path, stored, definition)
+    digest = public.digest(_fan_triangles(indices, counts) if triangles is None else triangles)
+    rig = public.metric(digest)
     return UsdRig(
-        rig=stored.metric(digest),
+        rig=rig if definition is None else with_helpers(rig, stored, definition),
         rig_hash=digest,
         face_vert_indices=indices,
         face_vert_counts=counts,

@@ -12,6 +12,7 @@ from soma_core.paths import assets_dir
 from soma_core.rig.manifest import (
     MANIFEST_NAME,
     NEUTRAL_NAME,
+    PROCEDURAL_NAME,
     RIG_NAME,
     check_files,
     read_manifest,
@@ -108,7 +109,7 @@ def verify_assets(root: Path | None = None) -> list[str]:
     findings = check_files(root, manifest)
     findings += [
         f"{root / MANIFEST_NAME}: does not list {name}. Make it again with `soma assets build`"
-        for name in (RIG_NAME, NEUTRAL_NAME)
+        for name in (RIG_NAME, NEUTRAL_NAME, PROCEDURAL_NAME)
         if name not in manifest.files
     ]
     findings += _unlisted(root, set(manifest.files))

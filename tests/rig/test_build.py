@@ -9,8 +9,9 @@ from soma_core.errors import AssetError
 from soma_core.paths import assets_dir
 from soma_core.rig import build, load_canonical
 from soma_core.rig.build import build_assets
-from soma_core.rig.manifest import NEUTRAL_NAME, RIG_NAME, read_manifest
+from soma_core.rig.manifest import NEUTRAL_NAME, PROCEDURAL_NAME, RIG_NAME, read_manifest
 from soma_core.rig.neutral import ShapeSpace, load_shape_space, read_topology, write_neutral
+from soma_core.rig.procedural_json import read_procedural
 from soma_core.rig.source import SOURCE_SHA256, read_source, source_folder
 from soma_core.rig.usd import read_usd_rig
 
@@ -85,7 +86,8 @@ def test_shipped_files_equal_their_source(source):
 
 @needs_source
 def test_rebuild_gives_the_same_rig_bytes_and_the_same_arrays(built):
-    assert (built / RIG_NAME).read_bytes() == (assets_dir() / RIG_NAME).read_bytes()
+    for name in (RIG_NAME, PROCEDURAL_NAME):
+        assert (built / name).read_bytes() == (assets_dir() / name).read_bytes()
     assert read_manifest(built).rig_hash == read_manifest(assets_dir()).rig_hash
     shipped, again = read_topology(assets_dir() / NEUTRAL_NAME), read_topology(built / NEUTRAL_NAME)
     for name, array in shipped.items():
@@ -117,13 +119,14 @@ def test_usd_layout_is_the_documented_one():
     assert UsdGeom.GetStageUpAxis(stage) == "Y"
     assert stage.GetDefaultPrim().GetPath() == "/OUTPUT"
     skeleton = UsdSkel.Skeleton(stage.GetPrimAtPath("/OUTPUT/c_skeleton_grp/Root"))
-    assert len(skeleton.GetJointsAttr().Get()) == len(skeleton.GetRestTransformsAttr().Get()) == 78
+    assert len(skeleton.GetJointsAttr().Get()) == len(skeleton.GetRestTransformsAttr().Get()) == 110
     assert UsdSkel.Topology(skeleton.GetJointsAttr().Get()).Validate()
     assert stage.GetPrimAtPath("/OUTPUT/c_skeleton_grp/Root/Animation").GetTypeName() == "SkelAnimation"
     for name, vertices in (("c_skin_mid", 18056), ("c_skin_lo", 4505)):
         mesh = UsdGeom.Mesh(stage.GetPrimAtPath(f"/OUTPUT/c_geometry_grp/MainMesh/Meshes/{name}"))
         assert len(mesh.GetPointsAttr().Get()) == vertices
-        assert UsdSkel.BindingAPI(mesh).GetJointWeightsPrimvar().GetElementSize() == 14
+        influences = np.diff(load_canonical("mid")[1].procedural.weights.indptr).max()
+        assert UsdSkel.BindingAPI(mesh).GetJointWeightsPrimvar().GetElementSize() == influences
 
 
 @needs_source
@@ -206,5 +209,6 @@ def test_absent_source_names_the_package(monkeypatch):
 @needs_source
 def test_reader_gives_the_hash_that_the_builder_wrote(built):
     topology = read_topology(built / NEUTRAL_NAME)
-    found = read_usd_rig(built / RIG_NAME, triangles=topology["triangles"])
+    definition = read_procedural(built / PROCEDURAL_NAME)
+    found = read_usd_rig(built / RIG_NAME, triangles=topology["triangles"], definition=definition)
     assert found.rig_hash == read_manifest(built).rig_hash

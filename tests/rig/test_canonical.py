@@ -8,7 +8,7 @@ import pytest
 from soma_core.errors import AssetError, InputError
 from soma_core.paths import assets_dir
 from soma_core.rig import load_canonical
-from soma_core.rig.manifest import NEUTRAL_NAME, RIG_NAME, read_manifest
+from soma_core.rig.manifest import NEUTRAL_NAME, PROCEDURAL_NAME, RIG_NAME, read_manifest
 
 MIRROR_M = 1e-6  # the source's two sides differ by 2e-7 m
 ROTATION = 1e-12  # projected in float64
@@ -28,7 +28,7 @@ def low():
 def copied(tmp_path: Path) -> Path:
     root = tmp_path / "assets"
     root.mkdir()
-    for name in (RIG_NAME, NEUTRAL_NAME, "MANIFEST.json"):
+    for name in (RIG_NAME, NEUTRAL_NAME, PROCEDURAL_NAME, "MANIFEST.json"):
         shutil.copy(assets_dir() / name, root / name)
     return root
 

@@ -11,6 +11,7 @@ from soma_core.io import read_motion
 from soma_core.paths import assets_dir
 from soma_core.rig.manifest import (
     NEUTRAL_NAME,
+    PROCEDURAL_NAME,
     RIG_NAME,
     read_manifest,
     write_manifest,
@@ -18,16 +19,18 @@ from soma_core.rig.manifest import (
 from soma_core.tasks import assets
 from soma_core.tasks.assets import build_assets, verify_assets
 
+_NEEDED = (RIG_NAME, NEUTRAL_NAME, PROCEDURAL_NAME)
+
 
 @pytest.fixture
 def copied(tmp_path, monkeypatch):
     monkeypatch.setenv("SOMA_CACHE_DIR", str(tmp_path / "cache"))
     root = tmp_path / "assets"
     root.mkdir()
-    for name in (RIG_NAME, NEUTRAL_NAME):
+    for name in _NEEDED:
         shutil.copy(assets_dir() / name, root / name)
     shipped = read_manifest(assets_dir())
-    files = {name: shipped.files[name] for name in (RIG_NAME, NEUTRAL_NAME)}
+    files = {name: shipped.files[name] for name in _NEEDED}
     write_manifest(root, replace(shipped, files=files))
     return root
 
@@ -41,7 +44,7 @@ def relist(root, name):
 
 
 def test_shipped_assets_pass():
-    assert {RIG_NAME, NEUTRAL_NAME} <= set(verify_assets())
+    assert set(_NEEDED) <= set(verify_assets())
 
 
 def test_every_finding_is_listed(copied):
