@@ -238,6 +238,27 @@ def _fan_triangles(indices: np.ndarray, counts: np.ndarray) -> np.ndarray:
     return np.array(triangles, np.int32).reshape(-1, 3)
 
 
+def _read_stored(path: Path, stage: Usd.Stage, skin: Usd.Prim) -> StoredRig:
+    """The skeleton with the points and weights of a skin, in the unit and axes of the file."""
+    from pxr import UsdGeom
+
+    up = str(UsdGeom.GetStageUpAxis(stage))
+    if up not in ("Y", "Z"):
+        raise AssetError(path, cause=f"upAxis is {up}, expected Y or Z", fix="Export it again with +Y up")
+    skeleton = _read_skeleton(path, _skeleton_prim(path, stage, skin))
+    points = _bind_points(path, skin)
+    return StoredRig(
+        joint_names=skeleton.joint_names,
+        parents=skeleton.parents,
+        bind_world=skeleton.bind_world,
+        t_pose_world=skeleton.t_pose_world,
+        bind_shape=points,
+        weights=read_weights(path, skin, skeleton.joint_paths, len(points)),
+        unit=float(UsdGeom.GetStageMetersPerUnit(stage)),
+        up=up,
+    )
+
+
 def read_usd_rig(
     path: Path,
     *,
@@ -265,28 +286,11 @@ def read_usd_rig(
             weights that are negative, not finite, do not sum to 1 or name unknown joints, or a skeleton
             without a joint of the definition.
     """
-    from pxr import UsdGeom
-
     stage = _open(path)
-    up = str(UsdGeom.GetStageUpAxis(stage))
-    if up not in ("Y", "Z"):
-        raise AssetError(path, cause=f"upAxis is {up}, expected Y or Z", fix="Export it again with +Y up")
     skin = _choose_mesh(path, stage, mesh, lod)
-    skeleton = _read_skeleton(path, _skeleton_prim(path, stage, skin))
-    points = _bind_points(path, skin)
-    weights = read_weights(path, skin, skeleton.joint_paths, len(points))
-    indices, counts = _polygons(path, skin, len(points))
+    stored = _read_stored(path, stage, skin)
+    indices, counts = _polygons(path, skin, len(stored.bind_shape))
     uv, uv_indices = _texture(skin, len(indices))
-    stored = StoredRig(
-        joint_names=skeleton.joint_names,
-        parents=skeleton.parents,
-        bind_world=skeleton.bind_world,
-        t_pose_world=skeleton.t_pose_world,
-        bind_shape=points,
-        weights=weights,
-        unit=float(UsdGeom.GetStageMetersPerUnit(stage)),
-        up=up,
-    )
     public = stored if definition is None else public_rig(path, stored, definition)
     digest = public.digest(_fan_triangles(indices, counts) if triangles is None else triangles)
     rig = public.metric(digest)
