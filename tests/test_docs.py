@@ -80,7 +80,12 @@ def test_the_table_of_motion_keys_is_complete(tmp_path):
         translation=np.zeros((2, 3)),
         fps=30,
         joint_names=USER_JOINTS,
-        identity={"backend": "soma", "params": {"shape": [1.0]}, "rest": np.zeros((4, 3))},
+        identity={
+            "backend": "soma",
+            "params": {"shape": [1.0]},
+            "options": {"a": 1},
+            "rest": np.zeros((4, 3)),
+        },
     )
     write_motion(motion, tmp_path / "m.npz", joint_orient=np.tile(np.eye(3), (77, 1, 1)))
     with np.load(tmp_path / "m.npz", allow_pickle=False) as file:

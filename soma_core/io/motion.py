@@ -27,8 +27,9 @@ class Motion:
         convention: ``t_pose_relative`` (zero is the T-pose) or ``absolute_local``.
         rig_revision: revision of the rig the rotations were made for, empty if unknown.
         source: where the motion came from.
-        identity: optional backend name and parameters it was recorded with, and under ``rest`` a rest shape
-            (v, 3) [m] on the canonical mesh if no parameters describe it.
+        identity: optional backend name and parameters it was recorded with, ``options`` of the backend if
+            there were any, and under ``rest`` a rest shape (v, 3) [m] on the canonical mesh if no parameters
+            describe it.
         licence: licence or terms of the motion, empty if unknown.
 
     Raises:

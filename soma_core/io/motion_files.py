@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+import functools
 import json
-import zipfile
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Literal
 
@@ -17,6 +17,7 @@ from soma_core.io.joint_order import USER_JOINTS
 from soma_core.io.kimodo_npz import read_kimodo_npz
 from soma_core.io.motion import Convention, Motion
 from soma_core.io.npz_fields import check_rotations, open_npz
+from soma_core.io.npz_parts import write_npz_parts
 from soma_core.io.soma_npz import SCHEMA_VERSION, read_soma_npz
 
 __all__ = ["check_rig", "read_motion", "write_motion", "write_motion_parts"]
@@ -113,22 +114,8 @@ def write_motion_parts(
     arrays = _arrays(first, "matrix")
     if joint_orient is not None and first.convention == "t_pose_relative":
         arrays["joint_orient"] = np.asarray(joint_orient, np.float32)
-    arrays["poses"], arrays["transl"] = arrays["poses"][:0], arrays["transl"][:0]
-
-    def write(temporary: Path) -> None:
-        with zipfile.ZipFile(temporary, "w", zipfile.ZIP_DEFLATED) as archive:
-            for name, array in arrays.items():
-                if name in _LONG:
-                    _write_long(archive, name, _pieces(parts, name), like=array, count=frame_count)
-                else:
-                    _write_short(archive, name, array)
-
-    atomic_write(Path(path), write)
-
-
-def _write_short(archive: zipfile.ZipFile, name: str, array: np.ndarray) -> None:
-    with archive.open(f"{name}.npy", "w") as stream:
-        np.save(stream, array, allow_pickle=False)
+    pieces = {name: functools.partial(_pieces, parts, name) for name in _LONG}
+    write_npz_parts(path, arrays, pieces, count=frame_count)
 
 
 def _pieces(parts: Callable[[], Iterator[Motion]], name: str) -> Iterator[np.ndarray]:
@@ -137,23 +124,6 @@ def _pieces(parts: Callable[[], Iterator[Motion]], name: str) -> Iterator[np.nda
         if name == "poses":
             check_rotations("motion.rotations", part.rotations.astype(np.float64))
         yield getattr(part, _LONG[name])
-
-
-def _write_long(
-    archive: zipfile.ZipFile, name: str, pieces: Iterable[np.ndarray], *, like: np.ndarray, count: int
-) -> None:
-    """Write an array of `count` entries piece by piece; `like` tells its type and the shape of an entry."""
-    header = {"descr": like.dtype.str, "fortran_order": False, "shape": (count, *like.shape[1:])}
-    written = 0
-    with archive.open(f"{name}.npy", "w", force_zip64=True) as stream:
-        np.lib.format.write_array_header_2_0(stream, header)
-        for piece in pieces:
-            stream.write(np.ascontiguousarray(piece, like.dtype).tobytes())
-            written += len(piece)
-    if written != count:
-        raise InputError(
-            f"motion.{name}", got=f"{written} frames", expected=count, fix="Give every piece, once."
-        )
 
 
 def _check_joints(motion: Motion) -> None:
@@ -213,11 +183,17 @@ def _identity(identity: Mapping[str, object]) -> dict[str, object]:
     row = np.concatenate([np.empty(0), *(np.ravel(value) for value in plain.values())])[None]
     coefficients = identity.get("identity_coeffs", row)
     rest = {"identity_rest": np.asarray(identity["rest"], np.float32)} if "rest" in identity else {}
-    return rest | {
-        "identity_model_type": str(identity.get("backend", "")),
-        "identity_params": json.dumps(plain, sort_keys=True),
-        "identity_coeffs": np.asarray(coefficients, np.float32),
-    }
+    options = identity.get("options")
+    chosen = {"identity_options": json.dumps(options, sort_keys=True)} if options else {}
+    return (
+        rest
+        | chosen
+        | {
+            "identity_model_type": str(identity.get("backend", "")),
+            "identity_params": json.dumps(plain, sort_keys=True),
+            "identity_coeffs": np.asarray(coefficients, np.float32),
+        }
+    )
 
 
 def check_rig(motion: Motion, revision: str) -> bool:

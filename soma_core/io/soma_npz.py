@@ -172,12 +172,16 @@ def _convention(fields: NpzFields, convention: Convention | None) -> Convention:
 
 def _identity(fields: NpzFields) -> dict[str, object]:
     """Backend name and parameters, as far as the file tells."""
+    found: dict[str, object]
     backend = fields.text("identity_model_type", "")
     if not backend:
         return {}
     if "identity_params" in fields:
-        return {"backend": backend, "params": _parsed(fields), **_rest(fields)}
-    found: dict[str, object] = {"backend": backend}
+        found = {"backend": backend, "params": _parsed(fields, "identity_params"), **_rest(fields)}
+        if "identity_options" in fields:
+            found["options"] = _parsed(fields, "identity_options")
+        return found
+    found = {"backend": backend}
     for key in ("identity_coeffs", "scale_params"):
         if key in fields and fields.raw(key).dtype.kind == "f":
             found[key] = fields.raw(key).astype(np.float32)
@@ -199,15 +203,14 @@ def _rest(fields: NpzFields) -> dict[str, object]:
     return {"rest": rest.astype(np.float32)}
 
 
-def _parsed(fields: NpzFields) -> dict[str, object]:
-    text = fields.text("identity_params")
+def _parsed(fields: NpzFields, key: str) -> dict[str, object]:
+    text = fields.text(key)
     try:
-        params = json.loads(text)
-    except json.JSONDecodeError as error:
+        return dict(json.loads(text))
+    except (ValueError, TypeError) as error:
         raise fields.refuse(
-            "identity_params",
+            key,
             got=repr(text[:40]),
             expected="a JSON object",
             fix=f"Write valid JSON ({error}).",
         ) from error
-    return dict(params)

@@ -71,9 +71,10 @@ def run(config: DictConfig, output: Path) -> None:
         return
     motion = load_motion(config)
     kept = str(config.identity_from) == "motion"
+    options = given_params(config.backend.options)
     layer = SomaLayer(
         backend_of(motion) if kept else config.backend.name,
-        options=given_params(config.backend.options),
+        options={**motion.identity.get("options", {}), **options} if kept else options,
         lod=str(config.lod),
         device=config.device,
         kernels=str(config.kernels),

@@ -104,9 +104,10 @@ class FitJob:
         """Join the chunks into the files of the result, and delete them."""
         layer, chunks = self.inversion.layer, self.chunks
         source = f"fitted to {self.posed.sequence.path.name}"
+        identity = {**self.stored, **({"options": layer.options} if layer.options else {})}
         write_motion_parts(
             lambda: fitted_motions(
-                chunks, layer, fps=self.settings["fps"], source=source, identity=self.stored,
+                chunks, layer, fps=self.settings["fps"], source=source, identity=identity,
                 licence=self.licence,
             ),
             self.files.motion,

@@ -38,7 +38,11 @@ def motion():
         rig_revision="0123456789abcdef",
         source="a test",
         licence="CC0-1.0",
-        identity={"backend": "anny", "params": {"age": 0.2, "local": [0.1, -0.3]}},
+        identity={
+            "backend": "anny",
+            "params": {"age": 0.2, "local": [0.1, -0.3]},
+            "options": {"local_changes": True},
+        },
     )
 
 
@@ -160,6 +164,7 @@ def test_a_failed_write_leaves_the_old_file(motion, tmp_path, monkeypatch):
         ("transl", np.array(["a"]), r"transl: got shape \(1,\), dtype <U1"),
         ("source", np.array(["a", "b"]), r"source: got 2 texts"),
         ("source", 3.0, r"source: got dtype float64, expected text"),
+        ("identity_options", "[1]", r"identity_options: got '\[1\]', expected a JSON object"),
         ("identity_params", "{age", r"identity_params: got '\{age'"),
         ("identity_rest", np.zeros((4, 2)), r"identity_rest: got float64 of shape \(4, 2\)"),
     ],
@@ -402,7 +407,7 @@ def test_a_motion_in_pieces_is_the_same_file(motion, tmp_path):
 
 def test_pieces_that_do_not_fit_are_refused(motion, tmp_path):
     count = motion.frame_count
-    with pytest.raises(InputError, match=rf"motion\.poses: got {count - 1} frames, expected {count}"):
+    with pytest.raises(InputError, match=rf"poses: got {count - 1} frames, expected {count}"):
         write_motion_parts(pieces(motion, 1, count - 2), tmp_path / "m.npz", frame_count=count)
     skewed = replace(motion, rotations=2 * motion.rotations)
     with pytest.raises(InputError, match=r"motion\.rotations: got \|RᵀR - I\| = 3"):
