@@ -12,14 +12,16 @@ from soma_core.rig.procedural import ProceduralDefinition
 
 __all__ = ["fold_weights", "spread_weights"]
 
-_SMOOTHING = 0.06
-"""Half width, as a share of the bone, over which the hat functions of the helpers are averaged: removes
-the creases that piecewise linear weights leave at each helper, and reaches few vertices more."""
+_SMOOTHING = 0.1
+"""Half width, as a share of the bone, over which the hat functions of the helpers are averaged. Removes the
+ring that piecewise linear weights leave at each helper of a strongly twisted thigh; wider costs more influences
+and thins the limb."""
 
 _LEAST = 0.002
 """Shares below this are dropped: at a twist of 150 degrees they move skin by less than 0.1 mm."""
 
 _SIGNIFICAND = 24  # bits of a float32, the implicit one included
+_SMALLEST = 2.0**-149  # smallest float32; the rig holds weights that small
 
 
 def _ramp_integral(position: np.ndarray, low: float, high: float) -> np.ndarray:
@@ -46,7 +48,7 @@ def _exact_parts(weights: np.ndarray, shares: np.ndarray) -> np.ndarray:
 
     All are whole multiples of the last digit of the weight, so that no addition rounds.
     """
-    digit = np.ldexp(1.0, np.frexp(weights)[1] - _SIGNIFICAND)[:, None]
+    digit = np.maximum(np.ldexp(1.0, np.frexp(weights)[1] - _SIGNIFICAND), _SMALLEST)[:, None]
     parts = np.rint(weights[:, None] * shares / digit) * digit
     rows = np.arange(len(parts))
     parts[rows, parts.argmax(axis=1)] += weights - parts.sum(axis=1)
