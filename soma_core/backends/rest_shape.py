@@ -19,6 +19,7 @@ from soma_core.rig.skeleton import Rig
 from soma_core.skeleton.fit import SkeletonFit
 from soma_core.topology.compose import compose
 from soma_core.topology.correspondence import load_correspondence
+from soma_core.topology.lod_transfer import LodTransfer
 from soma_core.topology.transfer import CanonicalPassThrough, TopologyTransfer, make_transfer
 
 __all__ = ["ComposedRestShape", "ExactRestShape", "Isolation", "make_rest_shape"]
@@ -28,7 +29,10 @@ Isolation: TypeAlias = Callable[[Stage], AbstractContextManager[None]]
 
 
 class ExactRestShape(torch.nn.Module):
-    """Generator, transfer and skeleton fit one after the other, on every vertex."""
+    """Generator, transfer and skeleton fit one after the other, on every vertex.
+
+    With `reduction` the vertices that come out are those of its target; the skeleton is fitted before it.
+    """
 
     def __init__(
         self,
@@ -36,14 +40,17 @@ class ExactRestShape(torch.nn.Module):
         transfer: TopologyTransfer | CanonicalPassThrough,
         fit: SkeletonFit,
         isolated: Isolation,
+        reduction: LodTransfer | None = None,
     ) -> None:
         super().__init__()
         self.generator, self.transfer, self.fit, self._isolated = generator, transfer, fit, isolated
+        self.reduction = reduction
 
     def forward(self, params: Mapping[str, Tensor]) -> tuple[Tensor, Tensor]:
         """Vertices as planes (3, v, B) [m] and fitted transforms (B, J, 4, 4) [m]."""
         vertices = self.transfer(self._native(params))
-        return vertices.permute(2, 1, 0), self.fit(vertices)
+        points = vertices if self.reduction is None else self.reduction(vertices)
+        return points.permute(2, 1, 0), self.fit(vertices)
 
     def _native(self, params: Mapping[str, Tensor]) -> Tensor:
         if torch.compiler.is_compiling():  # a context around the plugin would break the graph
@@ -62,7 +69,7 @@ class ComposedRestShape(torch.nn.Module):
     """A linear backend as one matrix: vertices and skeleton moments from coefficients in one product.
 
     Joint positions and covariances are linear in the vertices and so in the coefficients; their rows are
-    stacked under those of the vertices.
+    stacked under those of the vertices. With `reduction` only the vertices that it needs are evaluated.
     """
 
     def __init__(
@@ -72,16 +79,25 @@ class ComposedRestShape(torch.nn.Module):
         fit: SkeletonFit,
         at: Tensor,
         isolated: Isolation,
+        reduction: LodTransfer | None = None,
     ) -> None:
         super().__init__()
         self._linear_coefficients, self.fit, self._isolated = linear.coefficients, fit, isolated
+        self.reduction = reduction
         composed = compose(linear, transfer, at)
-        self.vertex_count = len(composed.template) // 3
-        matrix = fit.matrix
-        self.register_buffer("template", _stack(matrix, composed.template[:, None]), persistent=False)
-        self.register_buffer("basis", _stack(matrix, composed.basis), persistent=False)
+        matrix, count = fit.matrix, len(composed.template) // 3
+        kept = torch.arange(count, device=at.device) if reduction is None else reduction.source_ids
+        self.vertex_count = len(kept)
+        self.register_buffer("template", _stack(matrix, composed.template[:, None], kept), persistent=False)
+        self.register_buffer("basis", _stack(matrix, composed.basis, kept), persistent=False)
         self.exact = composed.exact
         if self.exact is not None:
+            place = torch.full((count,), self.vertex_count, device=at.device)
+            place[kept] = torch.arange(self.vertex_count, device=at.device)
+            place = place[self.exact.rows]
+            chosen = torch.nonzero(place < self.vertex_count).squeeze(1)
+            self.register_buffer("offset_chosen", chosen, persistent=False)
+            self.register_buffer("offset_place", place[chosen], persistent=False)
             columns = matrix.tocsc()[:, self.exact.rows.cpu().numpy()].toarray()
             tensor = torch.as_tensor(columns, dtype=self.basis.dtype, device=self.basis.device)
             self.register_buffer("offset_moments", tensor, persistent=False)
@@ -98,9 +114,11 @@ class ComposedRestShape(torch.nn.Module):
         moments = stacked[size:].unflatten(0, (4 * self.fit.joint_count, 3))
         if self.exact is not None:
             offsets = self.exact.evaluate(coefficients)
-            points = points.index_add(1, self.exact.rows, offsets.transpose(0, 1))
+            points = points.index_add(1, self.offset_place, offsets[self.offset_chosen].transpose(0, 1))
             moments = moments + (self.offset_moments @ offsets.flatten(1)).view(*moments.shape)
         moments = moments.unflatten(0, (self.fit.joint_count, 4)).permute(3, 0, 1, 2)
+        if self.reduction is not None:
+            points = self.reduction.from_needed(points.permute(2, 1, 0)).permute(2, 1, 0)
         return points, self.fit.from_moments(moments)
 
     def coefficients(self, params: Mapping[str, Tensor]) -> Tensor:
@@ -111,10 +129,10 @@ class ComposedRestShape(torch.nn.Module):
             return self._linear_coefficients(params)
 
 
-def _stack(matrix: scipy.sparse.csr_array, vertex_major: Tensor) -> Tensor:
-    """Columns (v * 3, k) as planes (3 * v, k), with their moments (m * 3, k) underneath."""
+def _stack(matrix: scipy.sparse.csr_array, vertex_major: Tensor, kept: Tensor) -> Tensor:
+    """Columns (v * 3, k) as planes (3 * len(kept), k), with the moments (m * 3, k) of all underneath."""
     count, columns = vertex_major.shape[0] // 3, vertex_major.shape[1]
-    planes = vertex_major.view(count, 3, columns).transpose(0, 1).reshape(3 * count, columns)
+    planes = vertex_major.view(count, 3, columns)[kept].transpose(0, 1).reshape(3 * len(kept), columns)
     return torch.cat((planes, _apply_rows(matrix, vertex_major)))
 
 
@@ -141,9 +159,11 @@ def make_rest_shape(
     warp: bool,
     wrap_mesh: CanonicalMesh,
     isolated: Isolation,
+    reduction: LodTransfer | None = None,
 ) -> ExactRestShape | ComposedRestShape:
     """The rest-shape module of a backend: composed when it is linear, unless `exact` asks otherwise.
 
+    `mesh` and `rig` are those that the skeleton is fitted on; `reduction` leads from there to another LOD.
     `warp` chooses the Warp twin for the skeleton's rotations. `wrap_mesh` is the mid LOD, which wrap
     pairs are made for. What the wrap pair or the plugin's own code does wrong goes through `isolated`.
 
@@ -156,10 +176,10 @@ def make_rest_shape(
         correspondence = None if spec.wrap is None else load_correspondence(spec.wrap, wrap_mesh)
         transfer = make_transfer(spec, mesh, correspondence, dtype=dtype, device=device)
     if exact or not isinstance(generator, HasLinearBasis):
-        return ExactRestShape(generator, transfer, fit, isolated)
+        return ExactRestShape(generator, transfer, fit, isolated, reduction)
     with isolated("build"):
         linear = generator.linear_basis()
         with torch.no_grad():
             at = linear.coefficients(batch_parameters(spec, {}, device=device, dtype=dtype))[0]
     with isolated("wrap"):
-        return ComposedRestShape(linear, transfer, fit, at, isolated)
+        return ComposedRestShape(linear, transfer, fit, at, isolated, reduction)

@@ -29,6 +29,7 @@ from soma_core.rig.transforms import local_transforms, world_transforms
 from soma_core.rig.twist_template import procedural_document
 from soma_core.rig.twist_weights import spread_weights
 from soma_core.rig.usd_text import SkinMeshText, rig_text
+from soma_core.rig.xlo import LowSkin, XloSkin, make_xlo
 
 __all__ = ["build_assets"]
 
@@ -57,6 +58,7 @@ class _Built:
     definition: ProceduralDefinition
     weights: np.ndarray
     topology: Mapping[str, np.ndarray]
+    xlo: XloSkin
     rig_hash: str
 
 
@@ -107,7 +109,32 @@ def _derive(source: SourceRig) -> _Built:
         definition=definition,
         weights=spread_weights(weights, source.bind_shape, places, definition).toarray().astype(np.float32),
         topology=topology,
+        xlo=make_xlo(_low_skin(source, low, mirror)),
         rig_hash=digits,
+    )
+
+
+def _low_texture(source: SourceRig, low: LowMesh) -> tuple[np.ndarray, np.ndarray]:
+    """Texture coordinates (u, 2) of the low mesh, and their id at each corner."""
+    used, ids = np.unique(source.uv_quads[low.corner_quads, 1], return_inverse=True)
+    return source.uv[used], ids
+
+
+def _low_skin(source: SourceRig, low: LowMesh, mirror: np.ndarray) -> LowSkin:
+    count = low.vertex_count
+    uv, uv_indices = _low_texture(source, low)
+    return LowSkin(
+        points=source.bind_shape[:count],
+        face_vert_indices=low.face_vert_indices,
+        face_vert_counts=low.face_vert_counts,
+        uv=uv,
+        uv_indices=uv_indices,
+        weights=source.weights[:count],
+        joint_names=source.joint_names,
+        parents=source.parents,
+        joints=source.bind_world[:, :3, 3],
+        mirror=mirror[:count],
+        face_interior=source.face_interior[source.face_interior < count],
     )
 
 
@@ -126,8 +153,7 @@ def _skin(built: _Built, lod: str) -> SkinMeshText:
     suffix, count = ("", len(source.bind_shape)) if lod == "mid" else ("_low", built.low.vertex_count)
     uv, uv_indices = source.uv, source.uv_quads.reshape(-1)
     if lod == "low":
-        used, uv_indices = np.unique(source.uv_quads[built.low.corner_quads, 1], return_inverse=True)
-        uv = uv[used]
+        uv, uv_indices = _low_texture(source, built.low)
     joints, weights = _influences(built.weights)
     return SkinMeshText(
         name="c_skin_mid" if lod == "mid" else "c_skin_lo",
@@ -138,6 +164,23 @@ def _skin(built: _Built, lod: str) -> SkinMeshText:
         uv_indices=uv_indices,
         joint_indices=joints[:count],
         joint_weights=weights[:count],
+    )
+
+
+def _xlo_skin(built: _Built) -> SkinMeshText:
+    """The extra-low skin, its weights spread over the helpers by its own points."""
+    xlo, places = built.xlo, built.source.bind_world[:, :3, 3]
+    public = scipy.sparse.csr_array(xlo.weights.astype(np.float32), dtype=np.float64)
+    joints, weights = _influences(spread_weights(public, xlo.points, places, built.definition).toarray())
+    return SkinMeshText(
+        name="c_skin_xlo",
+        points=xlo.points,
+        face_vert_indices=xlo.triangles.reshape(-1),
+        face_vert_counts=np.full(len(xlo.triangles), 3, np.int32),
+        uv=xlo.uv,
+        uv_indices=xlo.uv_indices,
+        joint_indices=joints,
+        joint_weights=weights,
     )
 
 
@@ -154,7 +197,7 @@ def _usda(built: _Built) -> str:
         parents=parents,
         bind_world=bind,
         rest_local=local_transforms(rest, parents),
-        meshes=[_skin(built, "mid"), _skin(built, "low")],
+        meshes=[_skin(built, "mid"), _skin(built, "low"), _xlo_skin(built)],
         notes={"licence": _LICENCE, "origin": _ORIGIN, "rig_hash": built.rig_hash},
         comment="Canonical SOMA rig with its twist joints; restTransforms hold the T-pose. "
         "Written by soma assets build.",
@@ -260,8 +303,9 @@ def build_assets(output: Path, shape_space: Path | None = None) -> Manifest:
         "triangles_low": len(built.topology["triangles_low"]),
     }
     twist = {"twist_joints": len(built.definition.helpers)}
+    xlo = {"vertices_xlo": len(built.xlo.points), "triangles_xlo": len(built.xlo.triangles)}
     files = {
-        RIG_NAME: _entry(output / RIG_NAME, {**counts, **twist}, built, "cm", _ORIGIN),
+        RIG_NAME: _entry(output / RIG_NAME, {**counts, **xlo, **twist}, built, "cm", _ORIGIN),
         PROCEDURAL_NAME: _entry(
             output / PROCEDURAL_NAME,
             {"segments": len(built.definition.segments), **twist},

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
+from typing import get_args
 
 import numpy as np
 import scipy.sparse
+from scipy.spatial import cKDTree
 
 from soma_core.cache import cached_arrays, content_key
 from soma_core.errors import AssetError, InputError
@@ -25,6 +27,7 @@ from soma_core.rig.procedural import ProceduralDefinition, ProceduralRig
 from soma_core.rig.procedural_json import read_procedural
 from soma_core.rig.revision import lod_revision
 from soma_core.rig.skeleton import Rig
+from soma_core.rig.subdivision import split_polygons
 
 __all__ = ["load_canonical"]
 
@@ -55,6 +58,25 @@ def _mid_topology(topology: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
     return mid | {_SEGMENT + name: topology[_SEGMENT + name] for name in SEGMENT_NAMES}
 
 
+def _xlo_topology(
+    vertices: np.ndarray, indices: np.ndarray, counts: np.ndarray, low: CanonicalMesh
+) -> dict[str, np.ndarray]:
+    """Topology and segments of the extra-low LOD, which has no bags in the face.
+
+    A vertex belongs to the segments of the low vertex that is nearest to it.
+    """
+    outside = np.setdiff1d(np.arange(low.vertex_count), low.face_interior)
+    nearest = outside[cKDTree(low.vertices[outside]).query(vertices)[1]]
+    xlo = {
+        "mid_ids": np.empty(0, np.int32),
+        "triangles": split_polygons(indices, counts, vertices),
+        "mirror": cKDTree(vertices).query(vertices * [-1, 1, 1])[1].astype(np.int32),
+    }
+    for name, ids in low.segments.items():
+        xlo[_SEGMENT + name] = np.flatnonzero(np.isin(nearest, ids)).astype(np.int32)
+    return xlo
+
+
 def _parse(
     root: Path, lod: Lod, manifest: Manifest, definition: ProceduralDefinition
 ) -> dict[str, np.ndarray]:
@@ -68,7 +90,11 @@ def _parse(
         raise AssetError(root / RIG_NAME, cause=cause, fix="Make the assets again with `soma assets build`")
     rig, procedural = found.rig, found.rig.procedural
     assert procedural is not None
-    arrays = _mid_topology(topology) if lod == "mid" else _low_topology(topology)
+    if lod == "xlo":
+        low = load_canonical("low", root)[0]
+        arrays = _xlo_topology(rig.bind_shape, found.face_vert_indices, found.face_vert_counts, low)
+    else:
+        arrays = _mid_topology(topology) if lod == "mid" else _low_topology(topology)
     return arrays | {
         "joint_names": np.array(rig.joint_names),
         "parents": rig.parents,
@@ -97,15 +123,15 @@ def load_canonical(lod: Lod = "mid", root: Path | str | None = None) -> tuple[Ca
     cached, keyed by their contents.
 
     Args:
-        lod: "mid" (18,056 vertices) or "low" (4,505, an index subset of mid).
+        lod: "mid" (18,056 vertices), "low" (4,505, an index subset of mid) or "xlo" (612, a mesh of its own).
         root: assets folder; default: the shipped one.
 
     Raises:
         AssetError: a file is missing, damaged or not the one of the manifest.
         InputError: unknown `lod`.
     """
-    if lod not in ("mid", "low"):
-        raise InputError("lod", got=repr(lod), expected="'mid' or 'low'", fix="Choose one of the two.")
+    if lod not in get_args(Lod):
+        raise InputError("lod", got=repr(lod), expected="'mid', 'low' or 'xlo'", fix="Choose one of them.")
     root = assets_dir() if root is None else Path(root)
     manifest = read_manifest(root)
     sums = [verified_sha256(root, manifest, name) for name in (RIG_NAME, NEUTRAL_NAME, PROCEDURAL_NAME)]

@@ -10,7 +10,7 @@ import numpy as np
 
 __all__ = ["CanonicalMesh", "Lod"]
 
-Lod = Literal["mid", "low"]
+Lod = Literal["mid", "low", "xlo"]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -25,7 +25,7 @@ class CanonicalMesh:
         uv_indices: one UV id for each entry of ``face_vert_indices`` (int32).
         segments: name -> vertex ids of this LOD (int32, sorted).
         mirror: (v,) int32, the left/right partner of each vertex of this LOD.
-        mid_ids: (v,) int32, id of each vertex in the mid LOD.
+        mid_ids: (v,) int32, id of each vertex in the mid LOD; empty for xlo, whose vertices are its own.
         lod: which level this is.
         revision: first 16 hex digits of the rig hash, with ``-low`` for a derived LOD.
     """

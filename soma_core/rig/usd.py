@@ -27,6 +27,14 @@ __all__ = ["MESH_NAMES", "UsdRig", "read_usd_rig"]
 MESH_NAMES: dict[str, tuple[str, ...]] = {
     "mid": ("c_skin_mid", "c_bodyRig_mid", "c_skin"),
     "low": ("c_skin_lo", "c_bodyRig_lo", "c_skin_low", "c_bodyRig_low"),
+    "xlo": (
+        "c_skin_xlo",
+        "c_bodyRig_xlo",
+        "c_skin_extra_low",
+        "c_bodyRig_extra_low",
+        "c_body_xlo",
+        "skin_xlo",
+    ),
 }
 
 

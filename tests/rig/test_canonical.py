@@ -199,8 +199,8 @@ def test_revision_is_the_one_of_the_manifest(mid):
 
 
 def test_unknown_lod_is_refused():
-    with pytest.raises(InputError, match="'xlo'"):
-        load_canonical("xlo")
+    with pytest.raises(InputError, match="'high'"):
+        load_canonical("high")
 
 
 @pytest.mark.parametrize("name", [RIG_NAME, NEUTRAL_NAME])

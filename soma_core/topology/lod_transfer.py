@@ -1,0 +1,91 @@
+"""Vertices of one level of detail on the surface of another: how bodies reach the extra-low mesh.
+
+The extra-low vertices are none of the low ones, so they are carried by the same operator as a native
+topology (paper, section 3.3, equation 1): barycentric coordinates on the nearest face, and a height.
+"""
+
+from __future__ import annotations
+
+import hashlib
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from soma_core.cache import cached_arrays, content_key
+from soma_core.geometry.barycentric import raised_normal
+from soma_core.rig.mesh import CanonicalMesh
+from soma_core.topology.correspondence import Correspondence, build_correspondence
+
+__all__ = ["LodTransfer", "lod_correspondence"]
+
+_CODE_VERSION = "1"
+
+
+def lod_correspondence(source: CanonicalMesh, target: CanonicalMesh) -> Correspondence:
+    """Where the vertices of `target` lie on `source` at the bind shape; cached.
+
+    Faces of the bags in mouth and eyes carry nothing: they lie just under the lips and the lids.
+    """
+    shape = hashlib.sha256(np.ascontiguousarray(target.vertices).tobytes()).hexdigest()
+    key = content_key("lod", _CODE_VERSION, source.revision, shape)
+    outside = source.triangles[~np.isin(source.triangles, source.face_interior).any(axis=1)]
+
+    def build() -> dict[str, np.ndarray]:
+        made = build_correspondence(source.vertices, outside, target.vertices)
+        return {"corners": made.corners, "coordinates": made.coordinates, "distances": made.distances}
+
+    arrays = cached_arrays("lod", key, build)
+    return Correspondence(
+        **arrays,
+        native_count=source.vertex_count,
+        native_vertices=source.vertices,
+        native_triangles=outside,
+        wrap_vertices=target.vertices,
+        key=key,
+    )
+
+
+class LodTransfer(torch.nn.Module):
+    """Carries bodies from one level of detail to another; commutes with every similarity.
+
+    Args:
+        source: the mesh that bodies are given on.
+        target: the mesh that they are wanted on.
+
+    Attributes:
+        source_ids: ids of the source vertices that any target vertex depends on, sorted, (s,).
+    """
+
+    def __init__(
+        self, source: CanonicalMesh, target: CanonicalMesh, *, dtype: torch.dtype, device: torch.device | str
+    ) -> None:
+        super().__init__()
+        found = lod_correspondence(source, target)
+        self.source_count = source.vertex_count
+        source_ids, corners = np.unique(found.corners, return_inverse=True)
+        first, second, height = found.coordinates.T
+
+        def keep(name: str, array: np.ndarray, kind: torch.dtype) -> None:
+            tensor = torch.as_tensor(array, dtype=kind, device=device)
+            self.register_buffer(name, tensor, persistent=False)
+
+        keep("source_ids", source_ids, torch.int64)
+        keep("corners", corners.reshape(-1, 3), torch.int64)
+        keep("shares", np.stack([1 - first - second, first, second], 1), dtype)
+        keep("height", height, dtype)
+
+    def forward(self, vertices: Tensor) -> Tensor:
+        """Target vertices (B, t, 3) from source vertices (B, v, 3), any unit. Differentiable."""
+        return self.from_needed(vertices[:, self.source_ids])
+
+    def from_needed(self, needed: Tensor) -> Tensor:
+        """The same, from the vertices of `source_ids` alone, (B, s, 3)."""
+        corners = needed[:, self.corners]
+        plane = torch.einsum("nk,bnkc->bnc", self.shares, corners)
+        return plane + self.height[:, None] * raised_normal(corners)
+
+    def offsets(self, vertices: Tensor, offsets: Tensor) -> Tensor:
+        """What `offsets` of the source vertices, both (B, v, 3), move the target vertices by, (B, t, 3)."""
+        before = vertices[:, self.source_ids]
+        return self.from_needed(before + offsets[:, self.source_ids]) - self.from_needed(before)
