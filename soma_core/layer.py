@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Mapping
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import torch
 from torch import Tensor
@@ -20,6 +20,7 @@ from soma_core.rig import load_canonical
 from soma_core.rig.mesh import CanonicalMesh, Lod
 from soma_core.rig.skeleton import Rig
 from soma_core.skeleton.identity import Identity
+from soma_core.topology.lod_transfer import LodTransfer
 
 __all__ = ["Kernels", "SomaLayer"]
 
@@ -38,7 +39,7 @@ class SomaLayer(torch.nn.Module):
     Args:
         backend: name of an installed backend; ``soma backends`` lists them.
         options: the backend's own options.
-        lod: level of detail of every mesh that comes out.
+        lod: level of detail of every mesh that comes out; the skeleton of ``xlo`` is fitted on ``low``.
         device, dtype: of all constants and results; float32 or float64.
         kernels: ``torch`` (the reference), ``warp`` or ``auto``, whichever the benchmark found faster.
         exact: evaluate the generator and the transfer vertex by vertex even where the backend is linear
@@ -77,7 +78,7 @@ class SomaLayer(torch.nn.Module):
             "exact": exact, "repose": repose, "procedural": procedural, "validate": validate,
             "canonical": canonical, "registry": registry,
         }  # fmt: skip
-        _check_choice("lod", lod, ("mid", "low"))
+        _check_choice("lod", lod, get_args(Lod))
         _check_choice("kernels", kernels, ("auto", "torch", "warp"))
         _check_choice("dtype", dtype, (torch.float32, torch.float64))
         self.backend = backend
@@ -94,9 +95,13 @@ class SomaLayer(torch.nn.Module):
         self.device, self.dtype = device, dtype
         generator = self._registry.generator(self.backend, device=device, dtype=dtype, options=self.options)
         wrap_mesh = self.mesh if self.mesh.lod == "mid" else load_canonical("mid")[0]
+        mesh, rig, reduction = self.mesh, self.rig, None
+        if self.mesh.lod == "xlo":
+            mesh, rig = load_canonical("low")
+            reduction = LodTransfer(mesh, self.mesh, device=device, dtype=dtype)
         self.rest_shape = make_rest_shape(
-            self.spec, generator, self.mesh, self.rig, device=device, dtype=dtype, exact=self.exact,
-            warp=self.kernels != "torch", wrap_mesh=wrap_mesh,
+            self.spec, generator, mesh, rig, device=device, dtype=dtype, exact=self.exact,
+            warp=self.kernels != "torch", wrap_mesh=wrap_mesh, reduction=reduction,
             isolated=functools.partial(self._registry.isolated, self.backend),
         )  # fmt: skip
         self.animation = Animation(self.rig, device=device, dtype=dtype, kernels=self.kernels)
@@ -138,13 +143,17 @@ class SomaLayer(torch.nn.Module):
         """Prepare identities of bodies that no parameters describe, such as scans on the canonical mesh.
 
         Args:
-            rest: (batch, v, 3) [m], +Y up, near the bind pose; the skeleton is fitted to it.
+            rest: (batch, v, 3) [m], +Y up, near the bind pose; the skeleton is fitted to it, so that a layer
+                of lod ``xlo`` takes the low mesh.
 
         Raises:
             InputError: a wrong shape, dtype or device, or a NaN.
         """
-        check_rest(rest, self.mesh.vertex_count, self.dtype, self.device)
-        return self._identity({}, rest.permute(2, 1, 0).contiguous(), self.rest_shape.fit(rest))
+        reduction = self.rest_shape.reduction
+        count = self.mesh.vertex_count if reduction is None else reduction.source_count
+        check_rest(rest, count, self.dtype, self.device)
+        points = rest if reduction is None else reduction(rest)
+        return self._identity({}, points.permute(2, 1, 0).contiguous(), self.rest_shape.fit(rest))
 
     def _identity(self, params: Mapping[str, Tensor], points: Tensor, fitted: Tensor) -> Identity:
         rest, bind = self.animation.repose(points, fitted) if self.repose else (points, fitted)
