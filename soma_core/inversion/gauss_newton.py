@@ -250,7 +250,15 @@ class GaussNewton(torch.nn.Module):
 
     def slopes(self, turns: Tensor, places: Tensor, residual: Tensor) -> Tensor:
         """``J^T r`` (F, n + 1, 3) of the moments (F, T, 3, 4) of residuals, the translation last."""
-        torque, force = self._subtree_forces(turns, places, residual)
+        spread, force = self.subtree_forces(turns, places, residual)
+        torque = torch.stack(
+            (
+                spread[..., 1, 2] - spread[..., 2, 1],
+                spread[..., 2, 0] - spread[..., 0, 2],
+                spread[..., 0, 1] - spread[..., 1, 0],
+            ),
+            -1,
+        )
         return torch.cat((torque[:, self.variables], force[:, :1]), 1)
 
     def _subtree_moments(self, turns: Tensor, places: Tensor, second: Tensor) -> Tensor:
@@ -281,8 +289,13 @@ class GaussNewton(torch.nn.Module):
             sums.index_add_(2, above, columns)
         return sums
 
-    def _subtree_forces(self, turns: Tensor, places: Tensor, residual: Tensor) -> tuple[Tensor, Tensor]:
-        """Torque of each subtree about its joint and force on it, (F, J, 3) each."""
+    def subtree_forces(self, turns: Tensor, places: Tensor, residual: Tensor) -> tuple[Tensor, Tensor]:
+        """``sum q r^T`` (F, J, 3, 3) of each subtree about its joint, and the force on it (F, J, 3).
+
+        Args:
+            turns, places: of the joints, (F, J, 3, 3) and (F, J, 3).
+            residual: moments (F, T, 3, 4) of the residuals r.
+        """
         spread = turns.new_zeros(len(turns), self.joint_count, 3, 3)
         spread[:, self.joints] = turns[:, self.joints] @ residual[..., :3].transpose(-1, -2)
         force = turns.new_zeros(len(turns), self.joint_count, 3)
@@ -294,15 +307,7 @@ class GaussNewton(torch.nn.Module):
             moved = spread[:, level] + shift[..., :, None] * force[:, level][..., None, :]
             spread.index_add_(1, above, moved)
             force.index_add_(1, above, force[:, level])
-        torque = torch.stack(
-            (
-                spread[..., 1, 2] - spread[..., 2, 1],
-                spread[..., 2, 0] - spread[..., 0, 2],
-                spread[..., 0, 1] - spread[..., 1, 0],
-            ),
-            -1,
-        )
-        return torque, force
+        return spread, force
 
     def damped_step(self, matrix: Tensor, slope: Tensor, damping: Tensor) -> Tensor:
         """Damped step (F, n + 1, 3); Cholesky only, and no error check, so nothing waits for the device."""

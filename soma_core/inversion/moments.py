@@ -147,6 +147,11 @@ class SkinMoments(torch.nn.Module):
         frames = [self._one_target(near[f : f + 1], rest, f) for f in range(len(vertices))]
         return torch.cat(frames), origin
 
+    def of_vectors(self, vectors: Tensor, rest: RestMoments) -> Tensor:
+        """``sum o w r (b; 1)^T`` (F, T, 3, 4) of vectors r at the vertices, (F, v, 3) [m], of one identity."""
+        near, origin = self.target(vectors, rest)
+        return near + origin[:, None, :, None] * rest.own[..., 3:, :]
+
     def each(
         self, vertices: Tensor, identity: Identity, weights: Tensor, offsets: Tensor
     ) -> tuple[RestMoments, Tensor, Tensor]:

@@ -9,34 +9,26 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from soma_core.animation.engine import Animation
 from soma_core.backends.parameters import batch_parameters
 from soma_core.errors import InputError
 from soma_core.geometry.rotations import matrix_to_axis_angle
 from soma_core.inversion._inputs import check_weights
-from soma_core.inversion.gauss_newton import GaussNewton
-from soma_core.inversion.moments import RestMoments, SkinMoments
-from soma_core.inversion.problem import Pose
-from soma_core.inversion.start import ProcrustesStart, best_translation
-from soma_core.inversion.structure import skin_structure
 from soma_core.layer import Kernels
-from soma_core.native.model import NativeBody, native_rig
+from soma_core.native.model import NativeBody, NativeRig
 from soma_core.native.motion import NativeMotion
-from soma_core.native.refine import Refinement
+from soma_core.native.poses import PoseFit
+from soma_core.native.shape import fit_shape
 from soma_core.native.transfer import NativeTransfer
 from soma_core.plugin.registry import Registry, default_registry
-from soma_core.plugin.spec import HasSkinning
+from soma_core.plugin.spec import HasSkinning, SkinnedModel
 from soma_core.rig.mesh import Lod
+from soma_core.skeleton.identity import Identity
 from soma_core.topology.frames import METRES
 
 __all__ = ["NativeFit"]
 
 _CHUNK = 64
 """Frames fitted at a time: their posed meshes and the derivatives of those stay near the cache."""
-
-_SKIN_ITERATIONS = 40
-"""Largest number of steps before blend shapes come in; they cost next to nothing."""
-
 
 _PER_FRAME = (
     "rotations", "translation", "vertices", "vertex_error", "valid", "converged", "iterations", "residual",
@@ -64,9 +56,10 @@ class NativeFit(torch.nn.Module):
 
     Attributes:
         transfer: canonical vertices to the native topology.
+        joint_names: of the model.
 
     Raises:
-        InputError: the backend does not tell its skinning, or an option is out of range.
+        InputError: the backend does not tell its skinning.
         BackendError: the backend is not usable.
     """
 
@@ -84,11 +77,11 @@ class NativeFit(torch.nn.Module):
         registry: Registry | None = None,
     ) -> None:
         super().__init__()
-        device, registry = torch.device(device), registry or default_registry()
+        self.device, self.dtype = torch.device(device), dtype
+        kind = {"device": self.device, "dtype": dtype}
+        registry = registry or default_registry()
         self.iterations, self.tolerance = iterations, tolerance
-        self.transfer = NativeTransfer(backend, lod=lod, device=device, dtype=dtype, registry=registry)
-        self.spec, self.scale = self.transfer.spec, METRES[self.transfer.spec.unit]
-        generator = registry.generator(backend, device=device, dtype=dtype, options=options)
+        generator = registry.generator(backend, options=options, **kind)
         if not isinstance(generator, HasSkinning):
             raise InputError(
                 "backend",
@@ -97,17 +90,11 @@ class NativeFit(torch.nn.Module):
                 fix="NativeTransfer gives its vertices.",
             )
         self._generator, self._isolated = generator, lambda: registry.isolated(backend, "rest")
-        self.dtype, self.device = dtype, device
-        warp = kernels == "warp" or (kernels == "auto" and device.type == "cpu")
-        with self._isolated():
-            neutral = generator.skinning(self._one_body({}))
-        rig = native_rig(neutral, self.scale)
-        self.joint_names = rig.user_joint_names
-        structure = skin_structure(rig, self.transfer.covered.cpu().numpy())
-        self.moments = SkinMoments(structure, rig, dtype=dtype, device=device, warp=warp)
-        self.solver = GaussNewton(structure, dtype=dtype, device=device, warp=warp)
-        self.start = ProcrustesStart(structure, dtype=dtype, device=device)
-        self.animation = Animation(rig, dtype=dtype, device=device, kernels=kernels)
+        self.transfer = NativeTransfer(backend, lod=lod, registry=registry, **kind)
+        self.spec, self.scale = self.transfer.spec, METRES[self.transfer.spec.unit]
+        covered = self.transfer.covered.cpu().numpy()
+        self.rig = NativeRig(self._model(self._one_body({})), self.scale, covered, kernels=kernels, **kind)
+        self.joint_names = self.rig.joint_names
 
     @torch.no_grad()
     def forward(
@@ -120,19 +107,82 @@ class NativeFit(torch.nn.Module):
         """Fit every frame on its own, one body for all.
 
         Args:
-            vertices: canonical vertices (F, v, 3) [m], +Y up, such as ``layer.pose(...).vertices``.
-            params: the body's parameters, one sample; what is left out has its default.
+            vertices: canonical vertices (F, v, 3) [m], +Y up, such as ``layer.pose(...).vertices``, of any
+                backend.
+            params: the body's parameters, one sample; what is left out has its default. See
+                :meth:`fit_params` for those of an unknown body.
             weights: (n,) of native vertices, default 1; those without a counterpart never count.
 
         Raises:
-            InputError: a wrong shape, or parameters of several bodies.
+            InputError: a wrong shape, a negative weight, or parameters of several bodies.
         """
-        target = self.scale * self.transfer(vertices.to(self.device, self.dtype))
-        counted = self._weights(weights)
-        body = self._body(params)
-        rest = self._moments(body, counted)
-        parts = [self._fit(body, rest, part, counted) for part in target.split(_CHUNK)]
-        return _joined(parts)
+        target = self._native(vertices)
+        fit = self._prepared(self._one_body(params), self._weights(weights))
+        return _joined([self._fit(fit, part) for part in target.split(_CHUNK)])
+
+    @torch.no_grad()
+    def fit_params(
+        self,
+        vertices: Tensor,
+        *,
+        start: Mapping[str, Any] | None = None,
+        weights: Tensor | None = None,
+        frames: int = 20,
+        iterations: int = 10,
+    ) -> dict[str, Tensor]:
+        """Parameters of the one body whose best poses come nearest to the frames, batch of 1.
+
+        Gauss-Newton steps on the error that is left once every frame has taken its best pose under the
+        whole model. What the frames leave open stays at `start`.
+
+        Args:
+            vertices, weights: as for :meth:`forward`.
+            start: parameters to begin from; what is left out has its default.
+            frames: how many frames, spread over the motion, to look at.
+            iterations: largest number of steps.
+
+        Raises:
+            InputError: a wrong shape, a negative weight, parameters of several bodies, a count below one,
+                or no usable frame.
+        """
+        for name, value in (("frames", frames), ("iterations", iterations)):
+            if value < 1:
+                raise InputError(name, got=value, expected="at least 1", fix=f"Leave {name} out.")
+        spread = torch.linspace(0, len(vertices) - 1, min(frames, len(vertices))).round().long()
+        target, counted = self._native(vertices[spread]), self._weights(weights)
+        begin = self._one_body(start)
+        target, _, known = _finite(self._body(begin), target, counted)
+        if not bool(known.any()):
+            raise InputError(
+                "vertices",
+                got=f"{len(spread)} frames of which none is finite",
+                expected="frames of a body",
+                fix="Leave out frames without a body.",
+            )
+        sizes = {name: value.shape for name, value in begin.items()}
+
+        def named(points: Tensor) -> dict[str, Tensor]:
+            parts = points.split([shape[1:].numel() for shape in sizes.values()], 1)
+            return {name: part.reshape(-1, *sizes[name][1:]) for name, part in zip(sizes, parts, strict=True)}
+
+        def directions(point: Tensor) -> Identity:
+            units = torch.cat((point[None], point + torch.eye(len(point)).to(point)))
+            model = self._model(named(units))
+            rest, joints = (one[1:] - one[:1] for one in (model.rest, model.joints))
+            return self.rig.bodies(rest, joints)
+
+        point = fit_shape(
+            lambda point: self._prepared(named(point[None]), counted),
+            directions,
+            torch.cat([value.flatten() for value in begin.values()]),
+            target[known.any(1)],
+            iterations=iterations,
+        )
+        return named(point[None])
+
+    def _native(self, vertices: Tensor) -> Tensor:
+        """Native vertices (F, n, 3) in metres."""
+        return self.scale * self.transfer(vertices.to(self.device, self.dtype))
 
     def _one_body(self, params: Mapping[str, Any] | None) -> dict[str, Tensor]:
         batch = batch_parameters(self.spec, params, device=self.device, dtype=self.dtype)
@@ -146,47 +196,42 @@ class NativeFit(torch.nn.Module):
             )
         return batch
 
-    def _body(self, params: Mapping[str, Any] | None) -> NativeBody:
-        batch = self._one_body(params)
-        with self._isolated():
-            model = self._generator.skinning(batch)
-        return NativeBody(model, batch, self.animation, self.scale)
-
-    def _moments(self, body: NativeBody, weights: Tensor) -> RestMoments:
-        offsets = self.animation.bone_vectors(body.identity)
-        return self.moments.rest(body.identity, weights[None], offsets)
-
     def _weights(self, weights: Tensor | None) -> Tensor:
         """(n,) weights of native vertices; zero where there is no counterpart."""
         counted = self.transfer.covered.to(self.dtype)
         return counted if weights is None else counted * check_weights(weights, counted, 0)[0]
 
-    def _fit(self, body: NativeBody, rest: RestMoments, target: Tensor, weights: Tensor) -> NativeMotion:
+    def _model(self, params: Mapping[str, Tensor]) -> SkinnedModel:
+        with self._isolated():
+            return self._generator.skinning(params)
+
+    def _body(self, params: Mapping[str, Tensor]) -> NativeBody:
+        model = self._model(params)
+        identity = self.rig.bodies(model.rest, model.joints)
+        return NativeBody(params=params, identity=identity, pelvis=identity.bind_world[0, 1, :3, 3])
+
+    def _prepared(self, params: Mapping[str, Tensor], weights: Tensor) -> PoseFit:
+        body = self._body(params)
+        return PoseFit(self.rig, body, weights, iterations=self.iterations, tolerance=self.tolerance)
+
+    def _fit(self, fit: PoseFit, target: Tensor) -> NativeMotion:
         """Fit a chunk of frames (F, n, 3) [m]."""
-        used = weights > 0
-        valid = torch.isfinite(target[:, used]).flatten(1).all(1)
-        finite = torch.where((valid[:, None] & used)[..., None], target, body.identity.rest)
-        origin = finite[:, used][:, :1]
-        near = finite - origin
-        pose = self._skinned(rest, near)
-        if body.offsets is not None and self.iterations:
-            whole = Refinement(body=body, solver=self.solver, rest=rest, target=near, weights=weights)
-            pose = whole(pose, iterations=self.iterations, tolerance=self.tolerance)
-        rotations, pelvis = pose.relative[:, 1:], pose.translation
-        posed = body.posed(rotations, pelvis)
+        near, origin, known = _finite(fit.body, target, fit.weights)
+        valid = known.any(1)
+        pose = fit(near)
+        posed = fit.posed(pose)
         error = torch.linalg.vector_norm(posed - near, dim=-1)
-        residual = ((error.square() * weights).sum(1) / weights.sum()).sqrt()
-        unknown = ~(valid[:, None] & used)
+        residual = (error.square() @ fit.weights / fit.weights.sum()).sqrt()
         determined = torch.zeros(len(self.joint_names), dtype=torch.bool, device=self.device)
-        determined[self.solver.variables - 1] = True
-        translation = pelvis + origin[:, 0] - body.pelvis
+        determined[self.rig.solver.variables - 1] = True
+        translation = (pose.translation + origin - fit.body.pelvis) / self.scale
         return NativeMotion(
             joint_names=self.joint_names,
-            rotations=matrix_to_axis_angle(rotations).masked_fill(~valid[:, None, None], 0),
-            translation=(translation / self.scale).masked_fill(~valid[:, None], 0),
-            params=body.params,
-            vertices=(posed + origin) / self.scale,
-            vertex_error=error.masked_fill(unknown, torch.nan),
+            rotations=matrix_to_axis_angle(pose.relative[:, 1:]).masked_fill(~valid[:, None, None], 0),
+            translation=translation.masked_fill(~valid[:, None], 0),
+            params=fit.body.params,
+            vertices=(posed + origin[:, None]) / self.scale,
+            vertex_error=error.masked_fill(~known, torch.nan),
             determined=determined,
             valid=valid,
             converged=(pose.last_change < self.tolerance) & valid,
@@ -194,22 +239,21 @@ class NativeFit(torch.nn.Module):
             residual=residual.masked_fill(~valid, torch.nan),
         )
 
-    def _skinned(self, rest: RestMoments, target: Tensor) -> Pose:
-        """Poses of the skinning alone; translations in the frame of `target`."""
-        moments, origin = self.moments.target(target, rest)
-        relative = self.start(moments, rest)
-        pose = Pose.begin(relative, torch.zeros_like(origin))
-        joints = self.moments.joints
-        turns, places = self.solver.walk(pose, rest.offsets)
-        shift = best_translation(moments, rest, turns[:, joints], places[:, joints])
-        pose = self.solver(
-            moments, rest, replace(pose, translation=shift), iterations=_SKIN_ITERATIONS,
-            tolerance=self.tolerance,
-        )  # fmt: skip
-        return replace(pose, translation=pose.translation + origin)
+
+def _finite(body: NativeBody, target: Tensor, weights: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Targets about an origin of their own (F, n, 3) [m], the origin (F, 3), and which are known (F, n).
+
+    Vertices without weight take the place of the rest mesh, and so does a whole frame that has a gap.
+    """
+    used = weights > 0
+    whole = torch.isfinite(target[:, used]).flatten(1).all(1)
+    known = whole[:, None] & used
+    filled = torch.where(known[..., None], target, body.identity.rest)
+    origin = filled[:, used][:, 0]
+    return filled - origin[:, None], origin, known
 
 
 def _joined(parts: Sequence[NativeMotion]) -> NativeMotion:
     """One motion of consecutive chunks of frames."""
-    names = [name for name, value in vars(parts[0]).items() if name in _PER_FRAME]
-    return replace(parts[0], **{name: torch.cat([getattr(part, name) for part in parts]) for name in names})
+    joined = {name: torch.cat([getattr(part, name) for part in parts]) for name in _PER_FRAME}
+    return replace(parts[0], **joined)

@@ -1,8 +1,10 @@
-"""A native model as a rig: what the engine and the solver of this package need to pose and to fit it."""
+"""A native model as a rig: what poses it and what fits poses to it."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+import functools
+from collections.abc import Mapping
+from dataclasses import dataclass
 
 import numpy as np
 import scipy.sparse
@@ -10,11 +12,17 @@ import torch
 from torch import Tensor
 
 from soma_core.animation.engine import Animation
+from soma_core.inversion.gauss_newton import GaussNewton
+from soma_core.inversion.moments import SkinMoments
+from soma_core.inversion.start import ProcrustesStart
+from soma_core.inversion.structure import skin_structure
+from soma_core.layer import Kernels
+from soma_core.native.blend import blend_shapes
 from soma_core.plugin.spec import SkinnedModel
 from soma_core.rig.skeleton import Rig
 from soma_core.skeleton.identity import Identity
 
-__all__ = ["NativeBody", "native_rig"]
+__all__ = ["NativeBody", "NativeRig", "native_rig"]
 
 
 def native_rig(model: SkinnedModel, scale: float) -> Rig:
@@ -38,50 +46,84 @@ def native_rig(model: SkinnedModel, scale: float) -> Rig:
     )
 
 
+@dataclass(frozen=True, kw_only=True, eq=False)
 class NativeBody:
-    """One body of a native model, in metres: posed by the whole model, blend shapes included.
-
-    Args:
-        model: batch of 1.
-        params: that it was made from.
-        animation: of its rig.
-        scale: native unit [m].
+    """One body of a native model.
 
     Attributes:
-        identity: rest mesh and joints, without blend shapes.
+        params: that it was made from, batch of 1.
+        identity: rest mesh and joints [m], without blend shapes.
         pelvis: rest place (3,) [m] of the model's root joint.
-        offsets: maps relative rotations (F, J - 1, 3, 3) to what they add to the rest mesh (F, n, 3) [m];
-            None where a pose adds nothing.
+    """
+
+    params: Mapping[str, Tensor]
+    identity: Identity
+    pelvis: Tensor
+
+
+class NativeRig(torch.nn.Module):
+    """The joints of a native model, in metres and native axes: poses bodies, and steps on their error.
+
+    Args:
+        model: any body of it.
+        scale: native unit [m].
+        covered: (n,) bool, vertices that a fit may look at.
+        kernels: ``torch`` (the reference), ``warp`` or ``auto``.
+
+    Attributes:
+        joint_names: of the model's joints.
+        blended: whether poses add to the rest mesh before it is skinned.
+        animation, moments, solver, start: of the rig.
     """
 
     def __init__(
-        self, model: SkinnedModel, params: Mapping[str, Tensor], animation: Animation, scale: float
+        self,
+        model: SkinnedModel,
+        scale: float,
+        covered: np.ndarray,
+        *,
+        dtype: torch.dtype,
+        device: torch.device,
+        kernels: Kernels,
     ) -> None:
-        self.params, self._animation = params, animation
-        self.identity = _identity(model.rest, model.joints, scale)
-        self.pelvis = scale * model.joints[0, 0]
-        self.offsets: Callable[[Tensor], Tensor] | None = None
-        if model.pose_offsets is not None:
-            native = model.pose_offsets
-            self.offsets = lambda rotations: scale * native(rotations)
+        super().__init__()
+        rig = native_rig(model, scale)
+        structure = skin_structure(rig, covered)
+        warp = kernels == "warp" or (kernels == "auto" and device.type == "cpu")
+        kind = {"dtype": dtype, "device": device}
+        self.joint_names, self._scale, self._offsets = rig.user_joint_names, scale, model.pose_offsets
+        self.blended = model.pose_offsets is not None
+        self.animation = Animation(rig, kernels=kernels, **kind)
+        self.moments = SkinMoments(structure, rig, warp=warp, **kind)
+        self.solver = GaussNewton(structure, warp=warp, **kind)
+        self.start = ProcrustesStart(structure, **kind)
 
-    def posed(self, rotations: Tensor, pelvis: Tensor) -> Tensor:
-        """Vertices (F, n, 3) [m] of relative rotations (F, J - 1, 3, 3) and root places (F, 3) [m]."""
-        identity = self.identity
-        if self.offsets is not None:
-            identity = _with_rest(identity, identity.rest + self.offsets(rotations))
-        return self._animation.pose(identity, rotations, pelvis, absolute=False).vertices
+    def bodies(self, rest: Tensor, joints: Tensor) -> Identity:
+        """Rest meshes (batch, n, 3) and joints (batch, J, 3) in native units as identities [m]."""
+        points, places = self._scale * rest, self._scale * joints
+        bind = torch.eye(4, dtype=rest.dtype, device=rest.device).repeat(len(rest), joints.shape[1] + 1, 1, 1)
+        bind[:, 1:, :3, 3] = places
+        return Identity(rest=points, bind_world=bind, fitted_rest=points, fitted_world=bind)
 
+    def posed(self, body: NativeBody, rotations: Tensor, pelvis: Tensor) -> Tensor:
+        """Vertices (F, n, 3) [m] under the whole model. Differentiable.
 
-def _identity(rest: Tensor, joints: Tensor, scale: float) -> Identity:
-    """Bodies (batch, n, 3), (batch, J, 3) in native units as identities [m] of a native rig."""
-    points, places = scale * rest, scale * joints
-    bind = torch.eye(4, dtype=rest.dtype, device=rest.device).repeat(len(rest), joints.shape[1] + 1, 1, 1)
-    bind[:, 1:, :3, 3] = places
-    return Identity(rest=points, bind_world=bind, fitted_rest=points, fitted_world=bind)
+        Args:
+            body: which.
+            rotations: local rotations (F, J, 3, 3).
+            pelvis: places (F, 3) [m] of the root joint.
+        """
+        bind = body.identity.bind_world
+        rest = body.identity.rest
+        if self._offsets is not None:
+            rest = rest + self._scale * self._offsets(rotations)
+        shaped = Identity(rest=rest, bind_world=bind, fitted_rest=rest, fitted_world=bind)
+        return self.animation.pose(shaped, rotations, pelvis, absolute=False).vertices
 
-
-def _with_rest(identity: Identity, rest: Tensor) -> Identity:
-    return Identity(
-        rest=rest, bind_world=identity.bind_world, fitted_rest=rest, fitted_world=identity.bind_world
-    )
+    @functools.cached_property
+    def blend_shapes(self) -> Tensor:
+        """Blend shapes (9 J, n, 3) [m]; made when first asked for."""
+        assert self._offsets is not None
+        return self._scale * blend_shapes(
+            self._offsets, self.solver.eye.expand(1, len(self.joint_names), 3, 3)
+        )

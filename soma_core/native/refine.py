@@ -2,27 +2,21 @@
 
 from __future__ import annotations
 
-from collections import deque
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
-from soma_core.inversion.gauss_newton import GaussNewton
 from soma_core.inversion.moments import RestMoments
 from soma_core.inversion.problem import Pose
-from soma_core.native.model import NativeBody
+from soma_core.native.blend import BlendMoments
+from soma_core.native.model import NativeBody, NativeRig
 
 __all__ = ["Refinement"]
 
 _START_DAMPING = 1e-4
-_LOWER, _RAISE, _MOST_DAMPING = 0.2, 8.0, 1e6
+_LOWER, _RAISE, _MOST_DAMPING = 0.2, 4.0, 1e6
 """Levenberg damping, relative to the diagonal: start, factors after a good and a bad step, largest value."""
-
-
-_MEMORY = 8
-"""Steps that are remembered to correct the Gauss-Newton matrix by what blend shapes add to it."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -30,13 +24,15 @@ class _View:
     """A pose under the whole model.
 
     Attributes:
-        energy: (F,).
-        slope: half its derivative by turns in the axes of the parent, and by the translation, (F, n + 1, 3).
+        energy: (F,) [m^2], float64.
+        slope: half its derivative by turns in world axes, and by the translation, (F, n + 1, 3).
+        spread: sums of arm times residual of each joint's subtree about it, (F, J, 3, 3).
         turns, places: of the joints, (F, J, 3, 3) and (F, J, 3).
     """
 
     energy: Tensor
     slope: Tensor
+    spread: Tensor
     turns: Tensor
     places: Tensor
 
@@ -45,20 +41,21 @@ class _View:
 class Refinement:
     """Lowers the error of the model itself from a pose fitted without its blend shapes; never raises it.
 
-    Energy and slope are exact: one evaluation of the model and one derivative a step. The matrix is that of
-    the skinning alone, from moments, corrected by the steps taken so far (L-BFGS; Nocedal and Wright,
-    Numerical Optimization, 2006, algorithm 7.4): what blend shapes add to it is small in a good model.
+    Energy and slope are exact: one evaluation of the model and one derivative a step. The matrix comes
+    from moments, of the skinning at each step and of the blend shapes at the first.
 
     Attributes:
-        body: the model.
-        solver, rest: moments of the body without blend shapes, and what steps on them.
+        rig, body: the model.
+        rest: moments of the body without blend shapes.
+        blend: moments of the blend shapes.
         target: (F, n, 3) [m]; finite.
         weights: (n,).
     """
 
+    rig: NativeRig
     body: NativeBody
-    solver: GaussNewton
     rest: RestMoments
+    blend: BlendMoments
     target: Tensor
     weights: Tensor
 
@@ -74,15 +71,19 @@ class Refinement:
         pose = replace(start, accepted=torch.zeros_like(start.accepted))
         view = self._look(pose)
         damping = torch.full_like(start.last_change, _START_DAMPING)
+        raising = torch.full_like(damping, _RAISE)
         moving = torch.ones_like(start.accepted, dtype=torch.bool)
-        taken: deque[tuple[Tensor, Tensor]] = deque(maxlen=_MEMORY)
+        shaped = self.blend.matrix(pose.relative, view.turns, view.places, self.rig.solver)
         for _ in range(iterations):
-            step = self._step(view, damping, taken)
-            trial = self.solver.retract(pose, view.turns, self._in_world(view, step))
+            matrix = self._matrix(view) + shaped
+            step = self.rig.solver.damped_step(matrix, view.slope, damping)
+            trial = self.rig.solver.retract(pose, view.turns, step)
             seen = self._look(trial)
             change = seen.energy - view.energy
+            flat = step.flatten(1)
+            bent = (matrix.flatten(3, 4).flatten(1, 2) @ flat[..., None]).squeeze(-1)
+            gain = change / (flat * (bent + 2 * view.slope.flatten(1))).sum(1).double()
             better = moving & (change < 0)
-            taken.append((step, seen.slope - view.slope))
             last = (change.abs() / mass).sqrt().to(pose.last_change)
             pose = Pose(
                 relative=_chosen(better, trial.relative, pose.relative),
@@ -92,57 +93,61 @@ class Refinement:
             )
             parts = vars(seen).items()
             view = _View(**{name: _chosen(better, value, getattr(view, name)) for name, value in parts})
-            damping = (damping * torch.where(better, _LOWER, _RAISE).to(damping)).clamp_max(_MOST_DAMPING)
+            lower = (1 - (2 * gain - 1) ** 3).clamp(1 / 5, 2).to(damping)
+            damping = (damping * torch.where(better, lower, raising)).clamp_max(_MOST_DAMPING)
+            raising = torch.where(better, _RAISE, 2 * raising)
             moving = moving & ~(pose.last_change < tolerance)
             if not bool(moving.any()):
                 break
         return pose
 
+    def _matrix(self, view: _View) -> Tensor:
+        """Gauss-Newton matrix (F, n + 1, 3, n + 1, 3) of the skinning, with the residual's own curvature.
+
+        A residual bends the path of each joint's points. Only what raises the energy is added: the matrix
+        stays positive, and steps do not overshoot where two models differ.
+        """
+        none = view.turns.new_zeros(len(view.turns), len(self.rig.solver.joints), 3, 4)
+        matrix, _ = self.rig.solver.normal_equations(view.turns, view.places, self.rest.second, none)
+        spread = view.spread[:, self.rig.solver.variables]
+        trace = spread.diagonal(dim1=-2, dim2=-1).sum(-1)
+        bend = 0.5 * (spread + spread.transpose(-1, -2)) - trace[..., None, None] * self.rig.solver.eye
+        values, axes = torch.linalg.eigh(bend)
+        bend = (axes * values.clamp_min(0)[..., None, :]) @ axes.transpose(-1, -2)
+        each = torch.arange(bend.shape[1], device=bend.device)
+        matrix[:, each, :, each] += bend.transpose(0, 1)
+        return matrix
+
     def _look(self, pose: Pose) -> _View:
         rotations = pose.relative[:, 1:].detach().requires_grad_()
         pelvis = pose.translation.detach().requires_grad_()
         with torch.enable_grad():
-            step = self.body.posed(rotations, pelvis) - self.target
+            step = self.rig.posed(self.body, rotations, pelvis) - self.target
             energy = (self.weights * step.square().sum(-1)).double().sum(1)
             by_rotations, by_pelvis = torch.autograd.grad(energy.sum(), (rotations, pelvis))
-        product = (rotations.detach() @ by_rotations.transpose(-1, -2))[:, self.solver.variables - 1]
-        torque = torch.stack(
-            (
-                product[..., 1, 2] - product[..., 2, 1],
-                product[..., 2, 0] - product[..., 0, 2],
-                product[..., 0, 1] - product[..., 1, 0],
-            ),
-            -1,
+        turns, places = self.rig.solver.walk(pose, self.rest.offsets)
+        n = self.rig.solver.variables
+        torque = (
+            turns[:, self.rig.solver.parents[n]]
+            @ _torque(rotations.detach(), by_rotations)[:, n - 1, :, None]
         )
-        turns, places = self.solver.walk(pose, self.rest.offsets)
-        slope = 0.5 * torch.cat((torque, by_pelvis[:, None]), 1)
-        return _View(energy=energy.detach(), slope=slope, turns=turns, places=places)
+        slope = 0.5 * torch.cat((torque.squeeze(-1), by_pelvis[:, None]), 1)
+        residual = self.rig.moments.of_vectors(step.detach(), self.rest)
+        spread, _ = self.rig.solver.subtree_forces(turns, places, residual)
+        return _View(energy=energy.detach(), slope=slope, spread=spread, turns=turns, places=places)
 
-    def _step(self, view: _View, damping: Tensor, taken: Sequence[tuple[Tensor, Tensor]]) -> Tensor:
-        """Step (F, n + 1, 3) in the axes of the parents: the two loops of L-BFGS about the damped matrix."""
-        none = view.turns.new_zeros(len(damping), len(self.solver.joints), 3, 4)
-        matrix, _ = self.solver.normal_equations(view.turns, view.places, self.rest.second, none)
-        slope, memory = view.slope, []
-        for step, change in reversed(taken):
-            curvature = (step * change).sum((1, 2), keepdim=True)
-            share = torch.where(curvature > 0, 1 / curvature.clamp_min(torch.finfo(slope.dtype).tiny), 0.0)
-            along = share * (step * slope).sum((1, 2), keepdim=True)
-            slope = slope - along * change
-            memory.append((step, change, share, along))
-        turned = self._in_world(view, slope)
-        ahead = self._in_parents(view, self.solver.damped_step(matrix, turned, damping))
-        for step, change, share, along in reversed(memory):
-            back = share * (change * ahead).sum((1, 2), keepdim=True)
-            ahead = ahead - (along + back) * step
-        return ahead
 
-    def _in_world(self, view: _View, vectors: Tensor) -> Tensor:
-        above = view.turns[:, self.solver.parents[self.solver.variables]]
-        return torch.cat(((above @ vectors[:, :-1, :, None]).squeeze(-1), vectors[:, -1:]), 1)
-
-    def _in_parents(self, view: _View, vectors: Tensor) -> Tensor:
-        above = view.turns[:, self.solver.parents[self.solver.variables]].transpose(-1, -2)
-        return torch.cat(((above @ vectors[:, :-1, :, None]).squeeze(-1), vectors[:, -1:]), 1)
+def _torque(rotations: Tensor, slope: Tensor) -> Tensor:
+    """Derivative (..., 3) by turns ahead of rotations (..., 3, 3) from that by their entries."""
+    product = rotations @ slope.transpose(-1, -2)
+    return torch.stack(
+        (
+            product[..., 1, 2] - product[..., 2, 1],
+            product[..., 2, 0] - product[..., 0, 2],
+            product[..., 0, 1] - product[..., 1, 0],
+        ),
+        -1,
+    )
 
 
 def _chosen(better: Tensor, new: Tensor, old: Tensor) -> Tensor:

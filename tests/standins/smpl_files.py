@@ -60,7 +60,8 @@ def _skeleton(name: str) -> tuple[np.ndarray, np.ndarray]:
     for row, place in zip(regressor, places, strict=True):
         distance = np.linalg.norm(body.vertices - body.joints[place], axis=1)
         near = np.argsort(distance)[:_REGRESSOR_VERTICES]
-        row[near] = 1 / _REGRESSOR_VERTICES
+        points = np.concatenate((np.ones((1, len(near))), (body.vertices[near] - body.joints[place]).T))
+        row[near] = np.linalg.pinv(points)[:, 0]  # the smallest weights whose mean is the joint itself
     from soma_core.io.joint_order import PARENT_NAMES
 
     weights = np.zeros((family.vertex_count, family.joint_count))

@@ -1,0 +1,75 @@
+"""Best poses of one native body: aligned joint by joint, then by least squares under the whole model."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from soma_core.inversion.problem import Pose
+from soma_core.inversion.start import best_translation
+from soma_core.native.blend import BlendMoments
+from soma_core.native.model import NativeBody, NativeRig
+from soma_core.native.refine import Refinement
+
+__all__ = ["PoseFit"]
+
+_SKIN_ITERATIONS = 40
+"""Largest number of steps before blend shapes come in; they cost next to nothing."""
+
+
+class PoseFit:
+    """Fits poses of one body.
+
+    Args:
+        rig: of the model.
+        body: which body.
+        weights: (n,) of its vertices.
+        iterations: largest number of steps under the whole model.
+        tolerance: a frame rests once a step changed its energy by less, as a root mean square [m].
+
+    Attributes:
+        rest: moments of the body without blend shapes.
+        body, weights: as given.
+    """
+
+    def __init__(
+        self, rig: NativeRig, body: NativeBody, weights: Tensor, *, iterations: int, tolerance: float
+    ) -> None:
+        self.rig, self.body, self.weights = rig, body, weights
+        self._iterations, self._tolerance = iterations, tolerance
+        offsets = rig.animation.bone_vectors(body.identity)
+        self.rest = rig.moments.rest(body.identity, weights[None], offsets)
+        self._blend = None
+        if rig.blended and iterations:
+            self._blend = BlendMoments(rig.blend_shapes, rig.moments, self.rest, weights)
+
+    def __call__(self, target: Tensor, start: Pose | None = None) -> Pose:
+        """Poses for finite targets (F, n, 3) [m]; translations are places of the root joint.
+
+        `start` replaces the fit of the skinning alone.
+        """
+        pose = start or self._skinned(target)
+        if self._blend is None:
+            return pose
+        whole = Refinement(
+            rig=self.rig, body=self.body, rest=self.rest, blend=self._blend, target=target,
+            weights=self.weights,
+        )  # fmt: skip
+        return whole(pose, iterations=self._iterations, tolerance=self._tolerance)
+
+    def posed(self, pose: Pose) -> Tensor:
+        """Vertices (F, n, 3) [m] of poses."""
+        return self.rig.posed(self.body, pose.relative[:, 1:], pose.translation)
+
+    def _skinned(self, target: Tensor) -> Pose:
+        rig, rest = self.rig, self.rest
+        moments, origin = rig.moments.target(target, rest)
+        pose = Pose.begin(rig.start(moments, rest), torch.zeros_like(origin))
+        joints = rig.moments.joints
+        turns, places = rig.solver.walk(pose, rest.offsets)
+        shift = best_translation(moments, rest, turns[:, joints], places[:, joints])
+        pose = replace(pose, translation=shift)
+        pose = rig.solver(moments, rest, pose, iterations=_SKIN_ITERATIONS, tolerance=self._tolerance)
+        return replace(pose, translation=pose.translation + origin)
