@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any, Literal, get_args
 
 import torch
@@ -11,9 +12,11 @@ from torch import Tensor
 
 from soma_core._inputs import check_bone_scale, check_kind, check_rest, check_rotations, check_translation
 from soma_core.animation.engine import Animation, Body, ProceduralAnimation
+from soma_core.animation.kinematics import relative_from_absolute
 from soma_core.animation.posed import Posed
 from soma_core.backends.parameters import batch_parameters
 from soma_core.backends.rest_shape import make_rest_shape
+from soma_core.correctives.model import find_correctives, load_correctives
 from soma_core.errors import InputError
 from soma_core.plugin.registry import Registry, default_registry
 from soma_core.rig import load_canonical
@@ -46,6 +49,8 @@ class SomaLayer(torch.nn.Module):
             and could be composed; slower, the reference for tests.
         repose: bring every identity to the rig's bind pose (correctives and twist vanish there).
         procedural: skin with the rig's twist joints where it has any; without, on the 78 public joints alone.
+        correctives: checkpoint of pose correctives, None for none, or ``auto``: that of the shipped rig where
+            its twist joints are in use and bodies are reposed. ``correctives_file`` says what was found.
         validate: check that matrices are rotations. Finiteness is checked on CPU only, since on CUDA
             that would wait for the device.
         canonical: another mesh and rig than the shipped ones.
@@ -54,6 +59,7 @@ class SomaLayer(torch.nn.Module):
     Raises:
         InputError: an unknown dtype, LOD or kernel choice.
         BackendError: the backend is not installed or does not build.
+        AssetError: a checkpoint is missing, damaged or made for another rig.
     """
 
     def __init__(
@@ -68,6 +74,7 @@ class SomaLayer(torch.nn.Module):
         exact: bool = False,
         repose: bool = True,
         procedural: bool = True,
+        correctives: Path | str | None = "auto",
         validate: bool = True,
         canonical: tuple[CanonicalMesh, Rig] | None = None,
         registry: Registry | None = None,
@@ -75,8 +82,8 @@ class SomaLayer(torch.nn.Module):
         super().__init__()
         self._given = {
             "backend": backend, "options": dict(options or {}), "lod": lod, "kernels": kernels,
-            "exact": exact, "repose": repose, "procedural": procedural, "validate": validate,
-            "canonical": canonical, "registry": registry,
+            "exact": exact, "repose": repose, "procedural": procedural, "correctives": correctives,
+            "validate": validate, "canonical": canonical, "registry": registry,
         }  # fmt: skip
         _check_choice("lod", lod, get_args(Lod))
         _check_choice("kernels", kernels, ("auto", "torch", "warp"))
@@ -87,6 +94,8 @@ class SomaLayer(torch.nn.Module):
         self.exact, self.repose, self.validate = exact, repose, validate
         self.mesh, self.rig = canonical or load_canonical(lod)
         self.procedural = procedural and self.rig.procedural is not None
+        shipped = self.procedural and repose and canonical is None
+        self.correctives_file = find_correctives(correctives, shipped=shipped)
         self._registry = registry or default_registry()
         self.spec = self._registry.spec(backend)
         self._build(torch.device(device), dtype)
@@ -108,6 +117,16 @@ class SomaLayer(torch.nn.Module):
         self.posing = self.animation
         if self.procedural:
             self.posing = ProceduralAnimation(self.rig, device=device, dtype=dtype, kernels=self.kernels)
+        self.correctives = load_correctives(
+            self.correctives_file, self.mesh, self.rig, dtype=dtype, device=device
+        )
+
+    def extra_repr(self) -> str:
+        """What was chosen, for ``repr``."""
+        return (
+            f"backend={self.backend!r}, lod={self.mesh.lod!r}, procedural={self.procedural}, "
+            f"correctives={str(self.correctives_file) if self.correctives_file else None!r}"
+        )
 
     def _apply(self, fn, recurse=True):  # noqa: ARG002 - PyTorch's signature
         """Rebuild for the new device or dtype: constants are derived in float64, never cast twice."""
@@ -193,7 +212,8 @@ class SomaLayer(torch.nn.Module):
                 that is not positive.
         """
         _, relative, shift, scale, _ = self._body(identity, rotations, translation, bone_scale)
-        return self.posing.pose(identity, relative, shift, absolute=absolute, bone_scale=scale)
+        moves = self._offsets(identity, relative, absolute=absolute)
+        return self.posing.pose(identity, relative, shift, absolute=absolute, bone_scale=scale, offsets=moves)
 
     def pose_plain(
         self,
@@ -204,10 +224,10 @@ class SomaLayer(torch.nn.Module):
         absolute: bool = False,
         bone_scale: Tensor | None = None,
     ) -> Posed:
-        """Pose by linear blend skinning on the public joints alone, without twist joints.
+        """Pose by linear blend skinning on the public joints alone, without twist joints or correctives.
 
         Takes and raises what :meth:`pose` does. Joints and their transforms are the same; the difference
-        of the vertices is what the twist joints add.
+        of the vertices is what twist joints and correctives add.
         """
         _, relative, shift, scale, _ = self._body(identity, rotations, translation, bone_scale)
         return self.animation.pose(identity, relative, shift, absolute=absolute, bone_scale=scale)
@@ -225,6 +245,15 @@ class SomaLayer(torch.nn.Module):
         if not isinstance(self.posing, ProceduralAnimation):
             return transforms[:, :0]
         return self.posing.helper_transforms(identity, transforms, bone_scale)
+
+    def _offsets(self, identity: Identity, relative: Tensor, *, absolute: bool) -> Tensor | None:
+        """What the correctives add to the rest shape, (batch, v, 3) [m]; None without them."""
+        if self.correctives is None:
+            return None
+        if absolute:
+            kinematics = self.animation.kinematics
+            relative = relative_from_absolute(relative, kinematics.orient[1:], kinematics.parent_orient[1:])
+        return self.correctives(relative, identity.bind_world)
 
     def _body(
         self, identity: Identity, rotations: Tensor, translation: Tensor | None, bone_scale: Tensor | None
@@ -283,13 +312,17 @@ class SomaLayer(torch.nn.Module):
         whole = tracked or identities < size or size <= _CHUNK or self.animation.warp_skinning
         if whole:
             identity = self._identity(batch, *self.rest_shape(batch))
-            return self.posing.pose(identity, relative, shift, absolute=absolute, bone_scale=bone_scale)
+            moves = self._offsets(identity, relative, absolute=absolute)
+            return self.posing.pose(
+                identity, relative, shift, absolute=absolute, bone_scale=bone_scale, offsets=moves
+            )
 
         def body(chunk: slice) -> Body:
             part = {name: value[chunk] for name, value in batch.items()}
             scale = None if bone_scale is None else bone_scale.expand(size, -1)[chunk]
             identity = self._identity(part, *self.rest_shape(part))
-            return Body(identity, relative[chunk], shift[chunk], scale)
+            moves = self._offsets(identity, relative[chunk], absolute=absolute)
+            return Body(identity, relative[chunk], shift[chunk], scale, moves)
 
         bodies = (body(slice(start, start + _CHUNK)) for start in range(0, size, _CHUNK))
         return self.posing.pose_all(bodies, size, absolute=absolute)

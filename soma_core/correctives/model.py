@@ -1,0 +1,122 @@
+"""Pose correctives as the layer applies them: sparse in memory and in compute (paper, section 3.5.2)."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from soma_core.correctives.features import PoseFeatures
+from soma_core.correctives.weights import (
+    CHECKPOINT_NAME,
+    CorrectiveWeights,
+    check_bind_pose,
+    read_weights,
+)
+from soma_core.errors import AssetError
+from soma_core.geometry.sparse import SparseRows
+from soma_core.paths import assets_dir
+from soma_core.rig.mesh import CanonicalMesh
+from soma_core.rig.skeleton import Rig
+
+__all__ = ["Correctives", "find_correctives", "load_correctives"]
+
+
+class Correctives(torch.nn.Module):
+    """Displacements of the rest shape that depend on the pose: ``tanh(relu(f W1)) W2``.
+
+    Exactly zero in the bind pose. Both stages are sparse products whose weights already hold the masks;
+    what no vertex of this level of detail needs is left out.
+
+    Args:
+        weights: as read from a checkpoint.
+        rig: of the level of detail that comes out.
+        vertices: ids in the mid LOD of the vertices that come out.
+        dtype, device: of constants and results.
+    """
+
+    def __init__(
+        self,
+        weights: CorrectiveWeights,
+        rig: Rig,
+        vertices: np.ndarray,
+        *,
+        dtype: torch.dtype,
+        device: torch.device | str,
+    ) -> None:
+        super().__init__()
+        self.meta, self.use_tanh = weights.meta, weights.use_tanh
+        self.features = PoseFeatures(rig, dtype=dtype, device=device)
+        columns = (3 * vertices.astype(np.int64)[:, None] + np.arange(3)).ravel()
+        second = weights.second.T.tocsr()[columns].tocsc()
+        used = np.flatnonzero(np.diff(second.indptr))  # activations that move anything
+        self.first = SparseRows(weights.first.T.tocsr()[used], dtype=dtype, device=device)
+        self.second = SparseRows(second[:, used].tocsr(), dtype=dtype, device=device)
+        self._parents = [int(parent) for parent in rig.parents[2:]]
+        places = torch.as_tensor(rig.bind_world[None, :, :3, 3].copy())
+        self.length = float(self._skeleton_length(places))
+
+    def _skeleton_length(self, places: Tensor) -> Tensor:
+        """Sum of all bones below the Hips, (B,) [m], of joint places (B, J, 3)."""
+        return (places[:, 2:] - places[:, self._parents]).norm(dim=-1).sum(1)
+
+    def scale(self, bind_world: Tensor) -> Tensor:
+        """How large bodies are beside the canonical one, (B,), by the length of their bones."""
+        return self._skeleton_length(bind_world[..., :3, 3]) / self.length
+
+    def forward(self, relative: Tensor, bind_world: Tensor) -> Tensor:
+        """Offsets (B, v, 3) [m] of rest shapes in the bind pose. Differentiable.
+
+        Args:
+            relative: T-pose-relative rotations (B, J - 1, 3, 3).
+            bind_world: bind transforms of the identities (B or 1, J, 4, 4): offsets grow with the body.
+        """
+        batch = len(relative)
+        seen = self.features(relative).flatten(1).T.contiguous()
+        active = torch.relu(self.first(seen))
+        moved = self.second(torch.tanh(active) if self.use_tanh else active)
+        return moved.view(-1, 3, batch).permute(2, 0, 1) * self.scale(bind_world)[:, None, None]
+
+
+def find_correctives(given: Path | str | None, *, shipped: bool) -> Path | None:
+    """The checkpoint that is used; None for none.
+
+    Args:
+        given: a file, None, or ``auto`` for the shipped one.
+        shipped: whether ``auto`` may be the shipped one.
+
+    Raises:
+        AssetError: a file that was named is not there.
+    """
+    if given is None or (given == "auto" and not shipped):
+        return None
+    path = assets_dir() / CHECKPOINT_NAME if given == "auto" else Path(given)
+    if path.is_file():
+        return path
+    if given == "auto":
+        return None
+    raise AssetError(
+        path,
+        cause="file is missing",
+        fix="Train one with `soma train-correctives`, or pass correctives=None.",
+    )
+
+
+def load_correctives(
+    path: Path | None, mesh: CanonicalMesh, rig: Rig, *, dtype: torch.dtype, device: torch.device
+) -> Correctives | None:
+    """Read a checkpoint for one level of detail; None for no file.
+
+    Raises:
+        AssetError: damaged, or made for another rig or mesh.
+    """
+    if path is None:
+        return None
+    weights = read_weights(path)
+    check_bind_pose(path, weights, rig)
+    if weights.vertex_count <= int(mesh.mid_ids.max()):
+        cause = f"moves {weights.vertex_count} vertices, this mesh has ids up to {int(mesh.mid_ids.max())}"
+        raise AssetError(path, cause=cause, fix="Train them for this mesh with `soma train-correctives`.")
+    return Correctives(weights, rig, mesh.mid_ids, dtype=dtype, device=device)
