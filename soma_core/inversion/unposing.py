@@ -35,7 +35,7 @@ class Unposing:
     frames, ``y = M a + m`` its blended skinning transform: poses that squeeze a vertex flat count little.
     The change from `base` then minimises ``|change - that|^2 / l^4 + |Laplacian of the change|^2`` over the
     surface, the length ``l`` growing with the disagreement of the frames. Vertices that no frame shows
-    move with their surroundings.
+    move with their surroundings. ``m`` holds what the full model adds, its twist and correctives.
 
     Args:
         layer: the forward model.
@@ -75,9 +75,9 @@ class Unposing:
 
         And the mean squared error (v,) [m^2] that is left: how far the frames disagree.
         """
-        turn, shift = self._blends(identity, pose)
-        reached = (turn @ identity.rest[0].double()[:, None, :, None]).squeeze(-1) + shift
-        away = torch.where(weights[..., None] > 0, vertices.transpose(0, 1).double() - reached, 0.0)
+        turn = self._blends(identity, pose)
+        reached = self._layer.pose(identity, pose.rotations, pose.translation).vertices
+        away = torch.where(weights[..., None] > 0, (vertices - reached).transpose(0, 1).double(), 0.0)
         matrix = torch.einsum("vf,vfab,vfac->vbc", weights, turn, turn)
         pull = torch.einsum("vf,vfab,vfa->vb", weights, turn, away)
         total = weights.sum(1).clamp_min(torch.finfo(torch.float32).tiny)
@@ -87,16 +87,15 @@ class Unposing:
         left = (away - (turn @ change[:, None]).squeeze(-1)).square().sum(-1)
         return change.squeeze(-1), (weights * left).sum(1) / total
 
-    def _blends(self, identity: Identity, pose: InversionResult) -> tuple[Tensor, Tensor]:
-        """Blended skinning transforms of every vertex in every frame, (v, F, 3, 3) and (v, F, 3)."""
+    def _blends(self, identity: Identity, pose: InversionResult) -> Tensor:
+        """Blended skinning rotations of every vertex in every frame, (v, F, 3, 3), by the public joints."""
         animation, count = self._layer.animation, len(pose.rotations)
         turns, places = animation.kinematics(
             pose.rotations, animation.bone_vectors(identity), pose.translation
         )
-        joints = skinning_transforms(turns, places, identity.bind_world).transpose(0, 1)
+        joints = skinning_transforms(turns, places, identity.bind_world)[..., :3].transpose(0, 1)
         blends = sparse_product(animation.skinning.weights.csr, joints.flatten(1).contiguous())
-        blends = blends.view(-1, count, 3, 4).double()
-        return blends[..., :3], blends[..., 3]
+        return blends.view(-1, count, 3, 3).double()
 
     def _smoothed(self, change: np.ndarray, trust: np.ndarray) -> np.ndarray:
         """The change (v, 3) that keeps to `change` where `trust` (v,) is large, and is smooth elsewhere."""

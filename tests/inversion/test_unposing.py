@@ -1,6 +1,7 @@
 """Unposing: what skinning did is undone, whatever is in the way."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -49,6 +50,19 @@ def known(inversion, vertices, identity, poses):
 
 def skin(inversion):
     return inversion.default_weights > 0
+
+
+def test_what_the_full_model_adds_is_no_shape(poses):
+    full = SomaLayer("soma", lod="low", dtype=torch.float64)
+    assert full.procedural
+    body, turns, places = full.identity(), axis_angle_to_matrix(poses[0][:2]), poses[1][:2]
+    vertices, weights = (
+        full.pose(body, turns, places).vertices,
+        torch.ones(1, full.mesh.vertex_count).double(),
+    )
+    pose = SimpleNamespace(rotations=turns, translation=places)
+    found = Unposing(full, body)(vertices, weights, body, pose)
+    torch.testing.assert_close(found, body.rest, atol=UNCHANGED_M, rtol=0)
 
 
 def test_a_shape_that_explains_the_frames_stays(layer, inversion, poses):
