@@ -99,8 +99,7 @@ class Twist(torch.nn.Module):
 
         keep("start", procedural.start_joints)
         keep("end_user", ends - 1)
-        rows = [definition.helpers.index(helper) for helper in procedural.joint_names]
-        keep("place", definition.place(names)[rows])
+        keep("place", definition.place(names))
         keep("step", step)
         keep("axis", np.einsum("hab,hb->ha", step, axes))  # in the frame of the start joint
         keep("eye", np.eye(3))

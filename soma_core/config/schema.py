@@ -165,6 +165,7 @@ class AnimateConfig:
     translation: Translation = Translation.ground
     lod: Lod = Lod.mid
     kernels: Kernels = Kernels.auto
+    procedural: bool = True
     device: str = "cpu"
     seed: int = 0
     write: list[Product] = field(default_factory=lambda: list(Product))

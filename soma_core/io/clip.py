@@ -10,6 +10,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from soma_core.errors import InputError
+from soma_core.rig.expansion import expanded_rig, helper_bind
 from soma_core.rig.mesh import CanonicalMesh
 from soma_core.rig.skeleton import Rig
 
@@ -31,7 +32,7 @@ class SkinnedClip:
 
     Attributes:
         mesh: topology and UVs.
-        rig: joint names, parents and weights.
+        rig: joint names, parents and weights; twist joints are joints like the others.
         rest: bind shape of the identity, (v, 3) float64 [m].
         bind_world: (J, 4, 4) float64 world transforms at `rest` [m].
         t_pose_world: (J, 4, 4) float64 world transforms of the identity's T-pose [m].
@@ -85,6 +86,7 @@ def skinned_clip(
     transforms: Any,
     *,
     fps: float,
+    helpers: Any = None,
     name: str = "Body",
     colour: tuple[float, float, float] = BODY_COLOUR,
     metadata: Mapping[str, str] | None = None,
@@ -97,6 +99,9 @@ def skinned_clip(
         identity: one identity (batch size 1).
         transforms: ``Posed.transforms``, (frames, J, 4, 4) world transforms [m], tensor or array.
         fps: frames per second.
+        helpers: world transforms of the rig's twist joints, (frames, H, 4, 4) [m], as
+            ``SomaLayer.helper_transforms`` gives them; they become joints of the file, with the skin on
+            them. Default: the skin on the public joints alone.
         name: name of the body in the file.
         colour: sRGB colour in 0..1.
         metadata: texts to store in the file.
@@ -108,6 +113,10 @@ def skinned_clip(
     rest = _array("identity.rest", identity.rest, (1, vertices, 3))[0]
     bind_world = _array("identity.bind_world", identity.bind_world, (1, joints, 4, 4))[0]
     world = _array("transforms", transforms, (len(transforms), joints, 4, 4))
+    if rig.procedural is not None and helpers is not None:
+        count = len(rig.procedural.joint_names)
+        world = np.concatenate([world, _array("helpers", helpers, (len(world), count, 4, 4))], axis=1)
+        rig, bind_world = expanded_rig(rig), np.concatenate([bind_world, helper_bind(rig, bind_world)])
     t_pose = _t_pose(rig, bind_world)
     local = _to_local(world, rig.parents)
     return SkinnedClip(

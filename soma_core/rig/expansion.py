@@ -12,7 +12,7 @@ from soma_core.rig.procedural import ProceduralDefinition, ProceduralRig
 from soma_core.rig.skeleton import Rig
 from soma_core.rig.stored import StoredRig
 
-__all__ = ["helper_transforms", "public_rig", "with_helpers"]
+__all__ = ["expanded_rig", "helper_bind", "helper_transforms", "public_rig", "with_helpers"]
 
 
 def helper_transforms(world: np.ndarray, definition: ProceduralDefinition) -> np.ndarray:
@@ -68,3 +68,36 @@ def with_helpers(rig: Rig, stored: StoredRig, definition: ProceduralDefinition) 
         definition=definition,
     )
     return replace(rig, procedural=procedural)
+
+
+def helper_bind(rig: Rig, bind_world: np.ndarray) -> np.ndarray:
+    """Bind transforms (H, 4, 4) of the helpers of an identity, from those of its public joints (J, 4, 4) [m].
+
+    Placed by the definition, turned against their start joints as in the rig.
+    """
+    procedural = rig.procedural
+    assert procedural is not None
+    starts = procedural.start_joints
+    placed = bind_world[starts].copy()
+    template = np.swapaxes(rig.bind_world[starts, :3, :3], -1, -2)
+    placed[:, :3, :3] @= template @ procedural.bind_world[:, :3, :3]
+    placed[:, :3, 3] = procedural.definition.place(rig.joint_names) @ bind_world[:, :3, 3]
+    return placed
+
+
+def expanded_rig(rig: Rig) -> Rig:
+    """The rig with its helpers as ordinary joints after the public ones, for files that know no others."""
+    procedural = rig.procedural
+    assert procedural is not None
+    bind, t_pose = (
+        np.concatenate([world, helper_bind(rig, world)]) for world in (rig.bind_world, rig.t_pose_world)
+    )
+    return Rig(
+        joint_names=(*rig.joint_names, *procedural.joint_names),
+        parents=np.concatenate([rig.parents, procedural.start_joints]).astype(np.int32),
+        bind_world=bind,
+        t_pose_world=t_pose,
+        bind_shape=rig.bind_shape,
+        weights=procedural.weights,
+        revision=rig.revision,
+    )

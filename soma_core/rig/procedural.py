@@ -92,7 +92,7 @@ class ProceduralRig:
     """Procedural joints of a rig and the skin weights that include them.
 
     Attributes:
-        joint_names: H names.
+        joint_names: H names, those of `definition.helpers`.
         start_joints: (H,) int32, the public joint that carries each helper.
         bind_world: (H, 4, 4) float64 world transforms of the bind pose [m].
         weights: (v, J + H) scipy CSR float64, columns in the order public joints, helpers; summed back onto

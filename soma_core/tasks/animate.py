@@ -47,11 +47,13 @@ class Animated:
     Attributes:
         motion: the motion with the translation that was used.
         transforms: (frames, J, 4, 4) float32 world transforms [m].
+        helpers: (frames, H, 4, 4) float32 world transforms of the twist joints [m]; H = 0 without them.
         vertices: frame -> posed vertices (v, 3) [m], for the frames asked for.
     """
 
     motion: Motion
     transforms: np.ndarray
+    helpers: np.ndarray
     vertices: Mapping[int, np.ndarray]
 
 
@@ -78,6 +80,7 @@ def run(config: DictConfig, output: Path) -> None:
         lod=str(config.lod),
         device=config.device,
         kernels=str(config.kernels),
+        procedural=config.procedural,
     )
     stored = {"backend": layer.backend, "params": given_params(config.backend.params)}
     stored = dict(motion.identity) if kept else stored
@@ -146,19 +149,22 @@ def animate(
     if not check_rig(motion, layer.rig.revision):
         _log.info("the motion was made for rig %s; its relative rotations carry over", motion.rig_revision)
     path = _hips_path(layer, identity, motion, translation)
-    transforms, vertices, lowest = [], {}, np.inf
+    transforms, helpers, vertices, lowest = [], [], {}, np.inf
     wanted = set(keep or ())
     for start, posed in _posed_chunks(layer, identity, motion, path):
         transforms.append(posed.transforms.cpu().numpy())
+        helpers.append(layer.helper_transforms(identity, posed.transforms).cpu().numpy())
         lowest = min(lowest, float(posed.vertices[..., 1].min()))
         for frame in wanted & set(range(start, start + len(posed.vertices))):
             vertices[frame] = posed.vertices[frame - start].cpu().numpy().copy()
     shift = np.array([0, 0 if translation == "motion" else -lowest, 0], np.float32)
-    world = np.concatenate(transforms)
+    world, carried = np.concatenate(transforms), np.concatenate(helpers)
     world[:, 1:, :3, 3] += shift  # Root, which is virtual, stays at the origin
+    carried[..., :3, 3] += shift
     return Animated(
         motion=replace(motion, translation=path + shift, rig_revision=layer.rig.revision),
         transforms=world,
+        helpers=carried,
         vertices={frame: vertices[frame] + shift for frame in sorted(vertices)},
     )
 
@@ -224,6 +230,7 @@ def _write(config: DictConfig, output: Path, layer: SomaLayer, identity: Identit
             identity,
             result.transforms,
             fps=motion.fps,
+            helpers=result.helpers if layer.procedural else None,
             colour=backend_colour(layer.backend),
             metadata=_metadata(layer, motion),
         )

@@ -86,7 +86,13 @@ def _random_parameters(spec: BackendSpec, count: int, random: np.random.Generato
 
 def _bodies(name: str, config: DictConfig, pose: Motion) -> list[Body]:
     """The default identity of a backend, then random ones, posed and standing on the floor."""
-    layer = SomaLayer(name, lod=str(config.lod), device=config.device, kernels=str(config.kernels))
+    layer = SomaLayer(
+        name,
+        lod=str(config.lod),
+        device=config.device,
+        kernels=str(config.kernels),
+        procedural=config.procedural,
+    )
     generator = np.random.default_rng(config.seed)
     random = _random_parameters(layer.spec, _IDENTITIES - 1, generator)
     choices = [{}, *({key: rows[i] for key, rows in random.items()} for i in range(_IDENTITIES - 1))]
