@@ -19,6 +19,7 @@ __all__ = [
     "ConvertConfig",
     "EvaluateConfig",
     "Experiment",
+    "FitLod",
     "FrameRange",
     "Gallery",
     "IdentityChoice",
@@ -89,6 +90,14 @@ class LengthUnit(StrEnum):
 
 class Lod(StrEnum):
     """Level of detail of the canonical mesh."""
+
+    mid = "mid"
+    low = "low"
+    xlo = "xlo"
+
+
+class FitLod(StrEnum):
+    """Level of detail that poses are fitted on."""
 
     mid = "mid"
     low = "low"
@@ -243,7 +252,7 @@ class InvertConfig:
     unit: LengthUnit | None = None
     up: Upward | None = None
     topology: Topology = Topology.auto
-    lod: Lod = Lod.mid
+    lod: FitLod = FitLod.mid
     device: str = "cpu"
     seed: int = 0
     chunk: int = 256
@@ -259,12 +268,15 @@ class ConvertConfig:
     inversion: InversionChoice = field(default_factory=InversionChoice)
     input: str | None = None
     out: str = MISSING
+    to: str = "soma"
     fps: float | None = None
     unit: LengthUnit | None = None
     up: Upward | None = None
     gender: BodyGender | None = None
     most_betas: int | None = None
-    lod: Lod = Lod.mid
+    betas: list[float] | None = None
+    translation: Translation = Translation.motion
+    lod: FitLod = FitLod.mid
     device: str = "cpu"
     seed: int = 0
     chunk: int = 256

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 from soma_core.cache import atomic_write
 from soma_core.errors import AssetError, InputError, SomaError
 from soma_core.progress import progress
+from soma_core.tasks.convert_back import BackConverter
 from soma_core.tasks.convert_file import SUFFIXES, Converter, layout_of
 from soma_core.tasks.fit_job import ResultFiles
 
@@ -40,11 +41,15 @@ def run(config: DictConfig, output: Path) -> None:
         if path.is_dir():
             _convert_folder(config, path, output)
         else:
-            converted = Converter(config)(path, ResultFiles.of_folder(output), output / "chunks")
+            converted = _converter(config)(path, ResultFiles.of_folder(output), output / "chunks")
             _log.info("%s: %s", path.name, converted)
     except KeyboardInterrupt:
         _log.warning("stopped; the same command with out=%s goes on from here", output)
         raise
+
+
+def _converter(config: DictConfig) -> Converter | BackConverter:
+    return Converter(config) if config.to == "soma" else BackConverter(config)
 
 
 def _input(config: DictConfig) -> Path:
@@ -70,7 +75,7 @@ def _convert_folder(config: DictConfig, folder: Path, output: Path) -> None:
             expected="motion files, at any depth",
             fix="Name the folder that holds them.",
         )
-    convert, rows, errors = Converter(config), {}, []
+    convert, rows, errors = _converter(config), {}, []
     for file in progress(files, label="file", total=len(files), after=5.0):
         name = file.relative_to(folder.resolve()).as_posix()
         rows[name] = _row(convert, file, output, name, errors)
@@ -93,7 +98,9 @@ def _files(folder: Path) -> Iterator[Path]:
             yield file
 
 
-def _row(convert: Converter, file: Path, output: Path, name: str, errors: list[SomaError]) -> dict[str, Any]:
+def _row(
+    convert: Converter | BackConverter, file: Path, output: Path, name: str, errors: list[SomaError]
+) -> dict[str, Any]:
     """Convert one file of a folder; what becomes of it is one row of the report."""
     try:
         if layout_of(file) is None:
@@ -117,6 +124,7 @@ def _mirrored(output: Path, name: str) -> ResultFiles:
     report = output / "reports" / name
     return ResultFiles(
         motion=motion,
+        vertices=output / "vertices" / motion.relative_to(output / "motions"),
         frames=report.with_suffix(".frames.npz"),
         report=report.with_suffix(".json"),
         picture=report.with_suffix(".png"),

@@ -16,6 +16,7 @@ from soma_core.errors import InputError
 from soma_core.inversion import PoseInversion
 from soma_core.inversion.options import inversion_options
 from soma_core.io.amass import holds_smpl_motion
+from soma_core.io.motion import Motion
 from soma_core.io.motion_files import read_motion, write_motion
 from soma_core.io.npz_fields import open_npz
 from soma_core.io.sam3d import SAM3D_SUFFIXES
@@ -32,7 +33,7 @@ from soma_core.topology.frames import METRES
 if TYPE_CHECKING:
     from omegaconf import DictConfig
 
-__all__ = ["SUFFIXES", "Converted", "Converter", "Layout", "layout_of"]
+__all__ = ["SUFFIXES", "Converted", "Converter", "Layout", "earlier_report", "layout_of", "motion_of"]
 
 _log = logging.getLogger(__name__)
 
@@ -62,12 +63,26 @@ def layout_of(path: Path) -> Layout | None:
         return "soma" if "schema_version" in fields or {"poses", "transl"} <= {*fields.names} else None
 
 
+def motion_of(path: Path, config: DictConfig) -> Motion:
+    """Motion in a file of SOMA tools or kimodo."""
+    metres = METRES[str(config.unit)] if config.unit else None
+    unit = next((name for name, length in METRES_PER_UNIT.items() if length == metres), None)
+    return read_motion(path, fps=config.fps, unit=unit)
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Converted:
-    """What became of a file: its report, and whether an earlier run made it."""
+    """What became of a file: its report, and whether an earlier run made it.
+
+    Attributes:
+        report: as it was written.
+        earlier: whether an earlier run made it.
+        vertices: whether they are the result, and no motion.
+    """
 
     report: Mapping[str, Any]
     earlier: bool = False
+    vertices: bool = False
 
     @property
     def error_mm(self) -> Mapping[str, float | None] | None:
@@ -79,7 +94,7 @@ class Converted:
         told = f"{settings['layout']}, {self.report['frames']} frames at {settings['fps']:g} fps"
         earlier = " (by an earlier run)" if self.earlier else ""
         if error is None:
-            return f"{told}, rotations carried over{earlier}"
+            return f"{told}, {'posed' if self.vertices else 'rotations carried over'}{earlier}"
         if error["mean"] is None:
             return f"{told}, of which none could be used{earlier}"
         figures = f"mean {error['mean']:.3g}, P95 {error['p95']:.3g}, max {error['max']:.3g} mm"
@@ -129,9 +144,7 @@ class Converter:
 
     def _carry_over(self, path: Path, layout: Layout, files: ResultFiles) -> Converted:
         """Write the rotations of a file on this skeleton as they are, in metres."""
-        metres = METRES[str(self._config.unit)] if self._config.unit else None
-        unit = next((name for name, length in METRES_PER_UNIT.items() if length == metres), None)
-        motion = read_motion(path, fps=self._config.fps, unit=unit)
+        motion = motion_of(path, self._config)
         orient = load_canonical("mid")[1].t_pose_world[1:, :3, :3]
         write_motion(motion, files.motion, joint_orient=orient)
         report = {
@@ -156,7 +169,7 @@ class Converter:
             "identity": body.search or {"method": "known"}, "lod": layer.mesh.lod,
             "inversion": self._fit_settings, "rig": layer.rig.revision, "content": fingerprint(path),
         }  # fmt: skip
-        earlier = _earlier(files, settings)
+        earlier = earlier_report(files.report, files.motion, settings)
         if earlier is not None:
             return Converted(report=earlier, earlier=True)
         plan = {**settings, "shown": config.picture.frames}
@@ -179,20 +192,20 @@ class Converter:
         return Converted(report=_read_report(files.report))
 
 
-def _earlier(files: ResultFiles, settings: Mapping[str, Any]) -> dict[str, Any] | None:
-    """Report of an earlier run with the same settings on the same file; None where there is none.
+def earlier_report(file: Path, result: Path, settings: Mapping[str, Any]) -> dict[str, Any] | None:
+    """The report `file` if an earlier run left it and `result`, with the same settings for the same input.
 
     Raises:
         InputError: the earlier run had other settings.
     """
-    if not (files.motion.is_file() and files.report.is_file()):
+    if not (file.is_file() and result.is_file()):
         return None
-    report = _read_report(files.report)
+    report = _read_report(file)
     before, now = dict(report["settings"]), json.loads(json.dumps(settings, default=str))
     before.pop("found", None)
     if before.pop("content", None) != now.pop("content"):
         return None  # the file was written anew
-    refuse_other_settings(files.report, before, now)
+    refuse_other_settings(file, before, now)
     return report
 
 

@@ -35,9 +35,10 @@ _log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, kw_only=True)
 class ResultFiles:
-    """Where the results of a fit go."""
+    """Where results go: motions, or vertices where there are no motions to be had."""
 
     motion: Path
+    vertices: Path
     frames: Path
     report: Path
     picture: Path
@@ -47,6 +48,7 @@ class ResultFiles:
         """The usual names in a folder of their own."""
         return cls(
             motion=folder / "motion.npz",
+            vertices=folder / "vertices.npz",
             frames=folder / "frames.npz",
             report=folder / "report.json",
             picture=folder / "errors.png",

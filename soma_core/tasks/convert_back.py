@@ -1,0 +1,188 @@
+"""The way back: motions of this skeleton as pose parameters or vertices of another model."""
+
+from __future__ import annotations
+
+import json
+import logging
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from soma_core.cache import atomic_write
+from soma_core.errors import InputError
+from soma_core.io.amass import SMPL_JOINTS
+from soma_core.io.motion import Motion
+from soma_core.io.motion_files import check_rig
+from soma_core.layer import SomaLayer
+from soma_core.native import NativeFit, NativeTransfer
+from soma_core.progress import progress
+from soma_core.skeleton.identity import Identity
+from soma_core.tasks.animate import animate, given_params
+from soma_core.tasks.convert_file import Converted, earlier_report, layout_of, motion_of
+from soma_core.tasks.fit_job import ResultFiles, fingerprint
+from soma_core.tasks.fitted_chunks import FittedChunks
+from soma_core.tasks.native_results import NativeTarget, SmplTarget, VertexTarget
+from soma_core.tasks.stored_identity import stored_identity
+
+if TYPE_CHECKING:
+    from omegaconf import DictConfig
+
+__all__ = ["BackConverter"]
+
+_log = logging.getLogger(__name__)
+
+_SEARCHED = 20
+"""Frames, spread over the motion, that a body is found from."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _MovingBody:
+    """A motion on one identity."""
+
+    layer: SomaLayer
+    identity: Identity
+    motion: Motion
+
+    def posed(self, frames: slice | np.ndarray) -> Tensor:
+        """Canonical vertices (F, v, 3) [m] of some frames."""
+        motion, layer = self.motion, self.layer
+        rotations, hips = (
+            torch.as_tensor(values[frames]).to(layer.device, layer.dtype)
+            for values in (motion.rotations, motion.translation)
+        )
+        absolute = motion.convention == "absolute_local"
+        return layer.pose(self.identity, rotations, hips, absolute=absolute).vertices
+
+
+class BackConverter:
+    """Converts one motion after another to a backend's model; layers and fits serve all of them.
+
+    Args:
+        config: that of ``soma convert``, whose ``to`` names the backend.
+    """
+
+    def __init__(self, config: DictConfig) -> None:
+        self._config = config
+        self._layers: dict[str, SomaLayer] = {}
+        self._targets: dict[str, NativeFit | NativeTransfer] = {}
+
+    @torch.no_grad()
+    def __call__(self, path: Path, files: ResultFiles, chunks: Path) -> Converted:
+        """Convert a file; see ``Converter``."""
+        layout = layout_of(path)
+        if layout not in ("soma", "kimodo"):
+            raise InputError(
+                str(path),
+                got=f"the layout {layout}" if layout else "no motion under any key that is known",
+                expected="a motion on this skeleton, for the way back",
+                fix="Convert it with to=soma first.",
+            )
+        motion = motion_of(path, self._config)
+        layer, stored = self._body(path, motion)
+        target = self._target(stored)
+        settings = {
+            "input": str(path.resolve()), "layout": layout, "fps": motion.fps, "body": stored["backend"],
+            "body_params": stored.get("params"), "translation": str(self._config.translation),
+            "lod": layer.mesh.lod, "rig": layer.rig.revision, **target.facts, "content": fingerprint(path),
+        }  # fmt: skip
+        vertices = isinstance(target, VertexTarget)
+        earlier = earlier_report(files.report, files.vertices if vertices else files.motion, settings)
+        if earlier is not None:
+            return Converted(report=earlier, earlier=True, vertices=vertices)
+        kept = FittedChunks(chunks, settings, frame_count=motion.frame_count, size=self._config.chunk)
+        body = _placed(layer, stored_identity(layer, stored), motion, str(self._config.translation))
+        if isinstance(target, SmplTarget) and target.params is None:
+            target = replace(target, params=_found_params(kept.folder / "params.json", target, body))
+            settings["found"] = target.params
+        _convert_missing(body, target, kept)
+        figures = target.write(kept, files, fps=motion.fps, source=motion.source)
+        report = {"settings": settings, **figures}
+        text = json.dumps(report, indent=2, default=float) + "\n"
+        atomic_write(files.report, lambda file: file.write_text(text, encoding="utf-8") and None)
+        kept.remove()
+        return Converted(report=report, vertices=vertices)
+
+    def _body(self, path: Path, motion: Motion) -> tuple[SomaLayer, Mapping[str, Any]]:
+        """Whose body moves: that of the configuration, else that of the motion file."""
+        chosen, stored = self._config.backend, motion.identity
+        if chosen is not None:
+            stored = {
+                "backend": chosen.name, "params": given_params(chosen.params),
+                "options": given_params(chosen.options),
+            }  # fmt: skip
+        elif "params" not in stored and "rest" not in stored:
+            raise InputError(
+                "backend",
+                got=f"none, and no body in {path.name}",
+                expected="whose body moves",
+                fix="Pass backend=NAME and backend.params.KEY=VALUE; backend=soma is a mean body.",
+            )
+        name, options = str(stored["backend"]), dict(stored.get("options", {}))
+        key = f"{name} {sorted(options.items())}"
+        if key not in self._layers:
+            config = self._config
+            self._layers[key] = SomaLayer(name, options=options, lod=str(config.lod), device=config.device)
+        return self._layers[key], stored
+
+    def _target(self, stored: Mapping[str, Any]) -> NativeTarget:
+        """What becomes of the body; in the SMPL family it keeps the parameters that it has there."""
+        config, name = self._config, str(self._config.to)
+        kind = {"lod": str(config.lod), "device": config.device}
+        if name not in SMPL_JOINTS:
+            _refuse_for_vertices(config)
+            if name not in self._targets:
+                self._targets[name] = NativeTransfer(name, **kind)
+            return VertexTarget(transfer=self._targets[name])
+        own = stored if stored["backend"] == name and "rest" not in stored else {}
+        gender = str(config.gender or own.get("options", {}).get("gender", "neutral"))
+        params = {"betas": list(config.betas)} if config.betas is not None else own.get("params")
+        if gender not in self._targets:
+            self._targets[gender] = NativeFit(name, options={"gender": gender}, **kind)
+        return SmplTarget(
+            fit=self._targets[gender], model=name, gender=gender, up=f"+{config.up or 'z'}", params=params
+        )
+
+
+def _placed(layer: SomaLayer, identity: Identity, motion: Motion, translation: str) -> _MovingBody:
+    """The body where it is to stand."""
+    if not check_rig(motion, layer.rig.revision):
+        _log.info("the motion was made for rig %s; its relative rotations carry over", motion.rig_revision)
+    if translation != "motion":
+        motion = animate(layer, identity, motion, translation=translation).motion
+    return _MovingBody(layer=layer, identity=identity, motion=motion)
+
+
+def _found_params(file: Path, target: SmplTarget, body: _MovingBody) -> dict[str, list[float]]:
+    """Parameters of the model's body that comes nearest, or those that an earlier run found."""
+    if not file.is_file():
+        frames = body.motion.frame_count
+        spread = np.unique(np.linspace(0, frames - 1, min(_SEARCHED, frames)).round().astype(int))
+        _log.info("finding the body from %d frames", len(spread))
+        found = target.fit.fit_params(body.posed(spread))
+        text = json.dumps({name: value[0].tolist() for name, value in found.items()})
+        atomic_write(file, lambda path: path.write_text(text, encoding="utf-8") and None)
+    return dict(json.loads(file.read_text(encoding="utf-8")))
+
+
+def _convert_missing(body: _MovingBody, target: NativeTarget, kept: FittedChunks) -> None:
+    """Pose and convert the chunks that are not there yet."""
+    missing, total = kept.missing(), len(kept.ranges)
+    for number in progress(missing, label="chunk", total=total, done=total - len(missing), after=5.0):
+        kept.save(number, target.arrays(body.posed(slice(*kept.ranges[number]))))
+
+
+def _refuse_for_vertices(config: DictConfig) -> None:
+    """Refuse what only pose parameters have."""
+    for name in ("up", "gender", "betas"):
+        if config[name] is not None:
+            raise InputError(
+                name,
+                got=str(config[name]),
+                expected=f"none: to={config.to} gives vertices in the axes of that model",
+                fix=f"Leave {name} out.",
+            )

@@ -1,0 +1,187 @@
+"""Motions in another model's terms: what a chunk of frames keeps, and the files that all of them make."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from soma_core.cache import atomic_write
+from soma_core.inversion.histogram import bin_counts, quantile
+from soma_core.io.amass import Gender, SmplMotion, SmplName, write_amass
+from soma_core.io.npz_parts import write_npz_parts
+from soma_core.io.soma_npz import METRES_PER_UNIT
+from soma_core.io.vertex_sequence import UpAxis
+from soma_core.native import NativeFit, NativeMotion, NativeTransfer
+from soma_core.tasks.fit_job import ResultFiles
+from soma_core.tasks.fitted_chunks import FittedChunks
+from soma_core.topology.frames import METRES, native_to_canonical
+
+__all__ = ["NativeTarget", "SmplTarget", "VertexTarget"]
+
+_MM = 1e3
+_PER_FRAME = ("valid", "converged", "iterations", "mean_error", "largest_error")
+
+
+class NativeTarget(Protocol):
+    """What becomes of posed canonical vertices."""
+
+    @property
+    def facts(self) -> Mapping[str, Any]:
+        """What decides the result, for the report."""
+        ...
+
+    def arrays(self, vertices: Tensor) -> dict[str, np.ndarray]:
+        """What is kept of a chunk of frames (F, v, 3) [m]."""
+        ...
+
+    def write(self, chunks: FittedChunks, files: ResultFiles, *, fps: float, source: str) -> dict[str, Any]:
+        """Write the files that all chunks make together; return the figures of the report."""
+        ...
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class VertexTarget:
+    """Vertices in a backend's own topology, unit and axes.
+
+    Attributes:
+        transfer: to that topology.
+    """
+
+    transfer: NativeTransfer
+
+    @property
+    def facts(self) -> Mapping[str, Any]:
+        """The unit and the axes."""
+        spec = self.transfer.spec
+        return {"to": spec.name, "unit": spec.unit, "up": spec.up}
+
+    def arrays(self, vertices: Tensor) -> dict[str, np.ndarray]:
+        """The vertices."""
+        return {"vertices": self.transfer(vertices).float().cpu().numpy()}
+
+    def write(self, chunks: FittedChunks, files: ResultFiles, *, fps: float, source: str) -> dict[str, Any]:
+        """Write ``files.vertices``, which ``soma invert`` reads."""
+        _write_vertices(chunks, files, self.transfer, fps=fps, source=source, up=self.transfer.spec.up)
+        return {"frames": chunks.frame_count, "vertices": self.transfer.count}
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class SmplTarget:
+    """Pose parameters of SMPL, SMPL-H or SMPL-X, as AMASS stores them.
+
+    Attributes:
+        fit: to the model.
+        model, gender: which it is.
+        params: the body; None while it is yet to be found.
+        up: upward axis of the world that is written.
+    """
+
+    fit: NativeFit
+    model: SmplName
+    gender: Gender
+    params: Mapping[str, list[float]] | None
+    up: UpAxis
+
+    @property
+    def facts(self) -> Mapping[str, Any]:
+        """The body and the world."""
+        params = "found" if self.params is None else dict(self.params)
+        return {"to": self.model, "gender": self.gender, "params": params, "up": self.up}
+
+    def arrays(self, vertices: Tensor) -> dict[str, np.ndarray]:
+        """Parameters of the frames, and statistics of the error."""
+        if self.up == "+z":  # the fit does not care which way a body is turned
+            turn = torch.as_tensor(native_to_canonical("+z", "-y")).to(vertices)
+            vertices = vertices @ turn
+        found = self.fit(vertices, params=self.params)
+        return {
+            "rotations": found.rotations.float().cpu().numpy(),
+            "translation": found.translation.float().cpu().numpy(),
+            "determined": found.determined.cpu().numpy(),
+            **_statistics(found),
+        }
+
+    def write(self, chunks: FittedChunks, files: ResultFiles, *, fps: float, source: str) -> dict[str, Any]:
+        """Write ``files.motion`` in the layout of AMASS, and ``files.frames``."""
+        columns = {name: np.concatenate(list(_column(chunks, name))) for name in ("rotations", "translation")}
+        betas = np.array((self.params or {}).get("betas", []))
+        motion = SmplMotion(model=self.model, **columns, betas=betas, gender=self.gender, fps=fps, up=self.up)
+        write_amass(
+            motion, files.motion, extra={"source": np.array(source), "up_axis": np.array(self.up[1:].upper())}
+        )
+        frames = {name: np.concatenate(list(_column(chunks, name))) for name in _PER_FRAME}
+        atomic_write(files.frames, lambda path: np.savez_compressed(path, **frames))
+        return self._figures(chunks, frames)
+
+    def _figures(self, chunks: FittedChunks, frames: Mapping[str, np.ndarray]) -> dict[str, Any]:
+        total, number, counts = (sum(_column(chunks, name)) for name in ("sum", "number", "counts"))
+        (determined,) = chunks.load(0, "determined")
+        valid = int(frames["valid"].sum())
+        largest = float(np.nanmax(frames["largest_error"], initial=0)) if valid else np.nan
+        values = (
+            total / number if number else np.nan,
+            quantile(counts, 0.5),
+            quantile(counts, 0.95),
+            largest,
+        )
+        error = {
+            name: _MM * float(value) if valid else None
+            for name, value in zip(("mean", "median", "p95", "max"), values, strict=True)
+        }
+        names = zip(self.fit.joint_names, determined, strict=True)
+        return {
+            "frames": chunks.frame_count,
+            "unusable_frames": chunks.frame_count - valid,
+            "converged_share": int(frames["converged"].sum()) / valid if valid else None,
+            "undetermined_joints": [name for name, known in names if not known],
+            "error_mm": {"all": error},
+        }
+
+
+def _statistics(found: NativeMotion) -> dict[str, np.ndarray]:
+    """Of each frame, and sums over the vertices of all that can be joined."""
+    error = found.vertex_error.float().cpu().numpy()
+    known = np.isfinite(error)
+    number = known.sum(axis=1)
+    zeroed = np.where(known, error, 0)
+    usable = number > 0
+    return {
+        "valid": found.valid.cpu().numpy(),
+        "converged": found.converged.cpu().numpy(),
+        "iterations": found.iterations.cpu().numpy(),
+        "mean_error": np.where(usable, zeroed.sum(axis=1) / np.maximum(number, 1), np.nan).astype(np.float32),
+        "largest_error": np.where(usable, zeroed.max(axis=1), np.nan).astype(np.float32),
+        "sum": zeroed.sum(dtype=np.float64),
+        "number": number.sum(),
+        "counts": bin_counts(error[known]),
+    }
+
+
+def _column(chunks: FittedChunks, name: str) -> Iterator[np.ndarray]:
+    """One array of each chunk, in the order of the frames."""
+    return (array for (array,) in chunks.load_all(name))
+
+
+def _write_vertices(
+    chunks: FittedChunks, files: ResultFiles, transfer: NativeTransfer, *, fps: float, source: str, up: str
+) -> None:
+    unit = next(name for name, length in METRES_PER_UNIT.items() if length == METRES[transfer.spec.unit])
+    arrays = {
+        "vertices": np.empty((0, transfer.count, 3), np.float32),
+        "triangles": transfer.triangles.cpu().numpy().astype(np.int32),
+        "fps": np.asarray(fps),
+        "unit": np.asarray(unit),
+        "source": np.asarray(source),
+    }
+    if up in ("+y", "+z"):
+        arrays["up_axis"] = np.asarray(up[1:].upper())
+    pieces: dict[str, Callable[[], Iterator[np.ndarray]]] = {
+        "vertices": functools.partial(_column, chunks, "vertices")
+    }
+    write_npz_parts(files.vertices, arrays, pieces, count=chunks.frame_count)
