@@ -36,8 +36,8 @@ def shape_normal_equations(
     """``J^T J`` (k, k) and ``J^T r`` (k,) of k directions of shape, the poses of all frames eliminated.
 
     Column i of J is the motion of all vertices from the first identity to identity i + 1, over ``steps[i]``,
-    after every frame has turned its joints so as to undo it as well as it can (Schur complement). In
-    float64, not divided by anything.
+    after every frame has turned its joints so as to undo it as well as it can (Schur complement); in that,
+    skin follows the public joints alone. In float64, not divided by anything.
 
     Args:
         inversion: the pose fit.
@@ -56,9 +56,7 @@ def shape_normal_equations(
         weight = weights[frame] if len(weights) > 1 else weights[0]
         rest = shared or inversion.prepare(body, weight)
         turn, place = pose.rotations[frame : frame + 1], pose.translation[frame : frame + 1]
-        posed = inversion.layer.animation.pose(
-            identities, turn.expand(count, -1, 3, 3), place.expand(count, 3), absolute=False
-        ).vertices
+        posed = inversion.layer.pose(identities, turn, place.expand(count, 3)).vertices
         residual = torch.where(weight[:, None] > 0, posed[0] - vertices[frame], 0.0)
         fields = torch.cat((residual[None], posed[1:] - posed[:1])) / scale
         flat = (fields * weight.sqrt()[:, None]).flatten(1)

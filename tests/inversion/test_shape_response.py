@@ -19,7 +19,7 @@ SLOPE = 0.02
 
 @pytest.fixture(scope="module")
 def layer():
-    return SomaLayer("soma", lod="low", dtype=torch.float64)
+    return SomaLayer("soma", lod="low", dtype=torch.float64, procedural=False)
 
 
 @pytest.fixture(scope="module")

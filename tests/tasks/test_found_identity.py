@@ -23,8 +23,9 @@ from tests.plugin.fakes import FakeEntryPoint
 from tests.tasks import test_animate
 from tests.tasks.test_invert import Stopping, configured
 
-FOUND_MM = 0.2
-"""Largest distance between the input and what soma animate makes of the motion and the body found."""
+FOUND_MM = 0.5
+"""Largest distance between the input and what soma animate makes of the motion and the body found; poses are
+exact to some tenths, since what twist adds is looked at a few times only."""
 UNPOSED_MM = 2.0
 """The same, mean, where every vertex was free."""
 FRAMES = 6
@@ -43,7 +44,7 @@ def lean(monkeypatch):
 
 @pytest.fixture
 def source(lean, tmp_path):
-    layer = SomaLayer("lean", lod="low", procedural=False)
+    layer = SomaLayer("lean", lod="low")
     turns, hips = 0.25 * randn(FRAMES, 77, 3, seed=1).float(), 0.3 * randn(FRAMES, 3, seed=2).float()
     with torch.no_grad():
         vertices = layer.pose(layer.identity({"shape": TRUTH}), turns, hips).vertices
@@ -66,7 +67,7 @@ def animated(folder, frames):
     )  # fmt: skip
     animate.run(config, folder / "again")
     motion = read_motion(folder / "again/motion.npz")
-    layer = SomaLayer(motion.identity["backend"], lod="low", procedural=False)
+    layer = SomaLayer(motion.identity["backend"], lod="low")
     with torch.no_grad():
         body = animate.stored_identity(layer, motion.identity)
         result = animate.animate(layer, body, motion, translation="motion", keep=list(range(frames)))
@@ -89,7 +90,7 @@ def test_a_body_that_is_not_known_is_found_and_animated_again(source, tmp_path, 
 
 
 def test_an_unposed_body_travels_as_its_rest_shape(source, tmp_path):
-    invert.run(settings(source, method="unpose", free=[], iterations=14), tmp_path / "fit")
+    invert.run(settings(source, method="unpose", free=[], frames=6, iterations=14), tmp_path / "fit")
     motion = read_motion(tmp_path / "fit/motion.npz")
     assert motion.identity["params"] == {"shape": [0, 0, 0]}
     assert motion.identity["rest"].shape == (4505, 3)
