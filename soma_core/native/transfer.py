@@ -55,7 +55,7 @@ class NativeTransfer(torch.nn.Module):
 
     Raises:
         BackendError: the backend is not installed, or its wrap pair is missing or unusable.
-        InputError: the backend has no topology of its own.
+        InputError: the backend has no topology of its own, or `lod` is xlo.
     """
 
     def __init__(
@@ -68,6 +68,10 @@ class NativeTransfer(torch.nn.Module):
         registry: Registry | None = None,
     ) -> None:
         super().__init__()
+        if lod == "xlo":
+            raise InputError(
+                "lod", got="'xlo'", expected="'mid' or 'low'", fix="Pose the body at lod='low' or 'mid'."
+            )
         registry = registry or default_registry()
         self.spec = spec = registry.spec(backend)
         if spec.wrap is None:

@@ -38,7 +38,8 @@ def stored_identity(layer: SomaLayer, stored: Mapping[str, Any]) -> Identity:
     """Make the identity again: from its rest shape where there is one, else from its parameters.
 
     Args:
-        layer: the backend, and the LOD that is wanted; a rest shape of mid serves every LOD.
+        layer: the backend, and the LOD that is wanted; a rest shape of mid serves every LOD,
+            one of low also xlo.
         stored: ``params``, or ``rest`` (v, 3) [m] as :meth:`SomaLayer.identity_from_rest` takes it.
 
     Raises:
@@ -48,6 +49,7 @@ def stored_identity(layer: SomaLayer, stored: Mapping[str, Any]) -> Identity:
     if rest is None:
         return layer.identity(stored.get("params"))
     points = np.asarray(rest)
-    if layer.mesh.lod != "mid" and len(points) == load_canonical("mid")[0].vertex_count:
-        points = points[layer.mesh.mid_ids]
+    fitted = load_canonical("low")[0] if layer.mesh.lod == "xlo" else layer.mesh
+    if fitted.lod != "mid" and len(points) == load_canonical("mid")[0].vertex_count:
+        points = points[fitted.mid_ids]
     return layer.identity_from_rest(torch.as_tensor(points[None]).to(layer.device, layer.dtype))

@@ -135,7 +135,18 @@ def make_transfer(
     dtype: torch.dtype,
     device: torch.device | str,
 ) -> TopologyTransfer | CanonicalPassThrough:
-    """The transfer that a backend's declaration calls for, at the mesh's LOD."""
+    """The transfer that a backend's declaration calls for, at the mesh's LOD.
+
+    Raises:
+        InputError: the extra-low LOD, whose vertices are none of the wrap's.
+    """
+    if mesh.lod == "xlo":
+        raise InputError(
+            "lod",
+            got="'xlo'",
+            expected="'mid' or 'low' for vertices of a native topology",
+            fix="Take lod='low'; LodTransfer leads from there to xlo.",
+        )
     if correspondence is None:
         return CanonicalPassThrough(spec, mesh, dtype=dtype, device=device)
     local = correspondence.at(mesh.mid_ids) if mesh.lod != "mid" else correspondence
