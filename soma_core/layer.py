@@ -141,6 +141,11 @@ class SomaLayer(torch.nn.Module):
         return functools.partial(SomaLayer, **self._given, device=self.device, dtype=self.dtype), ()
 
     @property
+    def plain(self) -> bool:
+        """Whether :meth:`pose` is linear blend skinning alone, without twist joints and correctives."""
+        return self.posing is self.animation and self.correctives is None
+
+    @property
     def joint_names(self) -> tuple[str, ...]:
         """Names of the user joints, in the order of `rotations`."""
         return self.rig.user_joint_names
@@ -211,9 +216,12 @@ class SomaLayer(torch.nn.Module):
             InputError: a wrong shape, dtype or device, a NaN, a matrix that is no rotation, a bone scale
                 that is not positive.
         """
-        _, relative, shift, scale, _ = self._body(identity, rotations, translation, bone_scale)
-        moves = self._offsets(identity, relative, absolute=absolute)
-        return self.posing.pose(identity, relative, shift, absolute=absolute, bone_scale=scale, offsets=moves)
+        return self.pose_checked(self._body(identity, rotations, translation, bone_scale), absolute=absolute)
+
+    def pose_checked(self, body: Body, *, absolute: bool = False) -> Posed:
+        """:meth:`pose` without its checks, of rotation matrices: for loops that check once."""
+        moves = self._offsets(body.identity, body.relative, absolute=absolute)
+        return self.posing.pose(*body[:3], absolute=absolute, bone_scale=body.bone_scale, offsets=moves)
 
     def pose_plain(
         self,
@@ -312,10 +320,7 @@ class SomaLayer(torch.nn.Module):
         whole = tracked or identities < size or size <= _CHUNK or self.animation.warp_skinning
         if whole:
             identity = self._identity(batch, *self.rest_shape(batch))
-            moves = self._offsets(identity, relative, absolute=absolute)
-            return self.posing.pose(
-                identity, relative, shift, absolute=absolute, bone_scale=bone_scale, offsets=moves
-            )
+            return self.pose_checked(Body(identity, relative, shift, bone_scale), absolute=absolute)
 
         def body(chunk: slice) -> Body:
             part = {name: value[chunk] for name, value in batch.items()}

@@ -100,6 +100,10 @@ class Animation(torch.nn.Module):
             transforms=to_homogeneous(rotations, positions),
         )
 
+    def pose_body(self, body: Body) -> Posed:
+        """:meth:`pose` of arguments in one, T-pose-relative."""
+        return self.pose(*body[:3], absolute=False, bone_scale=body.bone_scale, offsets=body.offsets)
+
     def pose_all(self, bodies: Iterable[Body], batch: int, *, absolute: bool) -> Posed:
         """Pose a stream of chunks; no derivative. Each is dropped after use.
 

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 
 import torch
 from torch import Tensor
 
-from soma_core.animation.engine import Animation
+from soma_core.animation.engine import Animation, Body
+from soma_core.animation.posed import Posed
 from soma_core.animation.skinning import skinning_transforms
 from soma_core.inversion.problem import Problem
+from soma_core.layer import SomaLayer
 from soma_core.skeleton.identity import Identity
 
 __all__ = ["compare", "linear_targets", "part_of"]
@@ -23,23 +25,23 @@ _SAMPLED = 8
 
 
 def compare(
-    model: Animation, problem: Problem, relative: Tensor, translation: Tensor, *, warp: bool
+    layer: SomaLayer, problem: Problem, relative: Tensor, translation: Tensor, *, warp: bool
 ) -> tuple[Tensor, Tensor]:
     """Vertex errors (F, v) [m] and their weighted root mean square (F,) [m].
 
     Args:
-        model: the forward model.
+        layer: the forward model.
         problem: targets, weights and identity.
         relative: user joints' rotations (F, J - 1, 3, 3).
         translation: Hips positions (F, 3) [m], in the world.
-        warp: run the Warp twin, which knows linear blend skinning of one identity under one set of weights.
+        warp: run the Warp twin for plain skinning of one identity under one set of weights.
     """
     identity, weights = problem.identity, problem.weights
-    if warp and identity.batch_size == 1 and len(weights) == 1:
-        error, total = _by_warp(model, problem, relative, translation)
+    if warp and layer.plain and identity.batch_size == 1 and len(weights) == 1:
+        error, total = _by_warp(layer.animation, problem, relative, translation)
     else:
         error = problem.vertices.new_empty(problem.vertices.shape[:2])
-        for chunk, posed in _posed(model, problem, relative, translation):
+        for chunk, posed in _posed(layer.pose_checked, problem, relative, translation):
             step = posed.sub_(problem.vertices[chunk])
             torch.linalg.vector_norm(step, dim=-1, out=error[chunk])
         total = (error * error * weights).sum(1)
@@ -47,35 +49,34 @@ def compare(
 
 
 def linear_targets(
-    linear: Animation,
-    model: Animation,
+    layer: SomaLayer,
     problem: Problem,
     relative: Tensor,
     translation: Tensor,
     *,
+    plain: bool,
     robust: float | None,
 ) -> tuple[Tensor, Tensor]:
-    """Targets (F, v, 3) [m] for linear blend skinning, and the energy (F,) [m^2] of the full model.
+    """Targets (F, v, 3) [m] for plain skinning, and the energy (F,) [m^2] that the forward model has now.
 
-    What the full model adds at this pose, twist and correctives, is taken from the target. With `robust`,
-    vertices too far from their target ask for no more than that length [m]. Too far is farther than
-    `robust` and than twice the frame's median: a fit that outliers have dragged off finds its way back in
-    few rounds.
+    What twist and correctives add at this pose is taken from the target. With `robust`, vertices too far
+    from their target ask for no more than that length [m]. Too far is farther than `robust` and than twice
+    the frame's median: a fit that outliers have dragged off finds its way back in few rounds.
 
     Args:
-        linear: skinning by the public joints, which the solver knows.
-        model: the forward model; the same where it adds nothing.
-        problem, relative, translation: as in :func:`compare`.
+        layer, problem, relative, translation: as in :func:`compare`.
+        plain: the forward model is plain skinning.
     """
     targets, energy = torch.empty_like(problem.vertices), problem.vertices.new_empty(len(relative))
-    skinned = None if linear is model else _posed(linear, problem, relative, translation)
-    for chunk, posed in _posed(model, problem, relative, translation):
+    skinned = _posed(layer.animation.pose_body, problem, relative, translation)
+    whole = None if plain else _posed(layer.pose_checked, problem, relative, translation)
+    for chunk, base in skinned:
+        posed = base if whole is None else next(whole)[1]
         step = problem.vertices[chunk] - posed
         weights = problem.weights[chunk] if len(problem.weights) > 1 else problem.weights
         energy[chunk] = ((step * step).sum(-1) * weights).sum(-1)
         if robust is not None:
             step *= _share(step, weights, robust)[..., None]
-        base = posed if skinned is None else next(skinned)[1]
         torch.add(base, step, out=targets[chunk])
     return targets, energy
 
@@ -90,15 +91,14 @@ def _share(step: Tensor, weights: Tensor, robust: float) -> Tensor:
 
 
 def _posed(
-    model: Animation, problem: Problem, relative: Tensor, translation: Tensor
+    model: Callable[[Body], Posed], problem: Problem, relative: Tensor, translation: Tensor
 ) -> Iterator[tuple[slice, Tensor]]:
     """Reconstruction of a few frames at a time."""
     for first in range(0, len(relative), _POSED_AT_A_TIME):
         chunk = slice(first, first + _POSED_AT_A_TIME)
         scale, who = problem.bone_scale, part_of(problem.identity, chunk)
         scale = scale[chunk] if scale is not None and len(scale) > 1 else scale
-        turns, places = relative[chunk], translation[chunk]
-        yield chunk, model.pose(who, turns, places, absolute=False, bone_scale=scale).vertices
+        yield chunk, model(Body(who, relative[chunk], translation[chunk], scale)).vertices
 
 
 def _by_warp(

@@ -115,7 +115,6 @@ class PoseInversion(torch.nn.Module):
         self.layer, self.priors = layer, priors or PosePriors()
         # Not measured on CUDA, where one thread would hold a whole frame: the dense reference runs there.
         self.warp = warp = kernels == "warp" or (kernels == "auto" and layer.device.type == "cpu")
-        self.plain = layer.posing is layer.animation
         structure = moment_structure(layer.mesh, layer.rig)
         kind = {"dtype": layer.dtype, "device": layer.device}
         self.moments = SkinMoments(structure, layer.rig, warp=warp, **kind)
@@ -282,9 +281,7 @@ class PoseInversion(torch.nn.Module):
         pose = self.ladder(problem, start)
         relative = torch.where(usable[:, None, None, None], pose.relative, eye)[:, 1:]
         translation = torch.where(usable[:, None], pose.translation + origin, torch.zeros_like(origin))
-        error, residual = compare(
-            self.layer.posing, problem, relative, translation, warp=self.warp and self.plain
-        )
+        error, residual = compare(self.layer, problem, relative, translation, warp=self.warp)
         error.masked_fill_(~usable[:, None], torch.nan)
         if vertices is not frames.vertices:
             error.masked_fill_(~torch.isfinite(frames.vertices).all(-1), torch.nan)

@@ -104,8 +104,8 @@ class Ladder(torch.nn.Module):
     ) -> None:
         super().__init__()
         self.moments, self.options = moments, options
-        model = layer.posing if options.refreshes else layer.animation
-        self.outer = OuterLoop(layer.animation, model, moments, robust=options.robust)
+        plain = layer.plain or not options.refreshes
+        self.outer = OuterLoop(layer, moments, plain=plain, robust=options.robust)
         kind = {"dtype": layer.dtype, "device": layer.device}
         self.solver = GaussNewton(structure, warp=warp, **kind)
         self.start = ProcrustesStart(structure, **kind)
@@ -124,7 +124,7 @@ class Ladder(torch.nn.Module):
                 pose = getattr(self, f"_{stage}")(problem, pose)
         assert pose is not None
         rounds = self.options.robust_rounds if self.options.robust is not None else 0
-        if self.outer.model is not self.outer.linear:
+        if not self.outer.plain:
             rounds = max(rounds, self.options.refreshes)
         if rounds:
             pose = self.outer(problem, pose, self._refined, rounds=rounds)

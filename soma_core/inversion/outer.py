@@ -16,11 +16,11 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from soma_core.animation.engine import Animation
 from soma_core.geometry.rotations import axis_angle_to_matrix, matrix_to_axis_angle
 from soma_core.inversion.comparison import linear_targets
 from soma_core.inversion.moments import SkinMoments
 from soma_core.inversion.problem import Pose, Problem
+from soma_core.layer import SomaLayer
 
 __all__ = ["OuterLoop"]
 
@@ -35,22 +35,20 @@ class OuterLoop:
     """Repeats a solve against targets made anew.
 
     Args:
-        linear: skinning by the public joints, which the solver knows.
-        model: the forward model; the same object where it adds nothing to it.
-        moments: of the rig.
+        layer: the forward model.
+        moments: of its rig.
+        plain: fit plain skinning, whatever the forward model adds.
         robust: residuals beyond this count linearly [m]; None is least squares.
     """
 
-    def __init__(
-        self, linear: Animation, model: Animation, moments: SkinMoments, *, robust: float | None
-    ) -> None:
-        self.linear, self.model, self.moments, self.robust = linear, model, moments, robust
+    def __init__(self, layer: SomaLayer, moments: SkinMoments, *, plain: bool, robust: float | None) -> None:
+        self.layer, self.moments, self.plain, self.robust = layer, moments, plain, robust
 
     def __call__(
         self, problem: Problem, pose: Pose, solve: Callable[[Problem, Pose], Pose], *, rounds: int
     ) -> Pose:
         """The pose after `rounds` solves; under least squares, the best of those met, frame by frame."""
-        if self.model is self.linear:
+        if self.plain:
             for _ in range(rounds):
                 targets, _ = self._targets(problem, pose)
                 pose = self._solved(problem, targets, pose, solve)
@@ -70,7 +68,7 @@ class OuterLoop:
 
     def _targets(self, problem: Problem, pose: Pose) -> tuple[Tensor, Tensor]:
         turns, places = pose.relative[:, 1:], pose.translation + problem.origin
-        return linear_targets(self.linear, self.model, problem, turns, places, robust=self.robust)
+        return linear_targets(self.layer, problem, turns, places, plain=self.plain, robust=self.robust)
 
     def _solved(
         self, problem: Problem, targets: Tensor, pose: Pose, solve: Callable[[Problem, Pose], Pose]
