@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Any
 
 from soma_core.cache import atomic_write
 from soma_core.errors import AssetError, InputError, SomaError
-from soma_core.progress import progress
 from soma_core.tasks.convert_back import BackConverter
 from soma_core.tasks.convert_file import SUFFIXES, Converter, layout_of
 from soma_core.tasks.fit_job import ResultFiles
@@ -76,12 +75,19 @@ def _convert_folder(config: DictConfig, folder: Path, output: Path) -> None:
             fix="Name the folder that holds them.",
         )
     convert, rows, errors = _converter(config), {}, []
-    for file in progress(files, label="file", total=len(files), after=5.0):
+    for number, file in enumerate(files, start=1):
         name = file.relative_to(folder.resolve()).as_posix()
-        rows[name] = _row(convert, file, output, name, errors)
+        rows[name], told = _row(convert, file, output, name, errors)
+        level = logging.WARNING if rows[name]["state"] == _FAILED else logging.INFO
+        _log.log(level, "%d of %d: %s: %s", number, len(files), name, told)
         _write_rows(output / "report.json", folder, rows)
     counts = Counter(row["state"] for row in rows.values())
     _log.info("%s: %s", folder, ", ".join(f"{count} {state}" for state, count in counts.items()))
+    if counts[_SKIPPED] == counts.total():
+        raise InputError(
+            str(folder), got=f"{counts.total()} files without a motion", expected="motion files",
+            fix="soma convert input=FILE says what is missing in one of them.",
+        )  # fmt: skip
     if not counts[_FAILED]:
         return
     if len(errors) == counts.total():
@@ -100,31 +106,29 @@ def _files(folder: Path) -> Iterator[Path]:
 
 def _row(
     convert: Converter | BackConverter, file: Path, output: Path, name: str, errors: list[SomaError]
-) -> dict[str, Any]:
-    """Convert one file of a folder; what becomes of it is one row of the report."""
+) -> tuple[dict[str, Any], str]:
+    """Convert one file of a folder; what becomes of it as a row of the report, and in words."""
     try:
         if layout_of(file) is None:
-            return {"state": _SKIPPED, "reason": "holds no motion"}
+            return {"state": _SKIPPED, "reason": "holds no motion"}, "holds no motion"
         converted = convert(file, _mirrored(output, name), output / "chunks" / name)
     except SomaError as error:
-        _log.warning("%s: %s", name, error)
         errors.append(error)
-        return {"state": _FAILED, "reason": str(error)}
-    _log.info("%s: %s", name, converted)
+        return {"state": _FAILED, "reason": str(error)}, str(error)
     report = converted.report
-    return {"state": "converted", "layout": report["settings"]["layout"], "frames": report["frames"],
-            "fps": report["settings"]["fps"], "error_mm": converted.error_mm}  # fmt: skip
+    row = {"state": "converted", "layout": report["settings"]["layout"], "frames": report["frames"],
+           "fps": report["settings"]["fps"], "error_mm": converted.error_mm}  # fmt: skip
+    return row, str(converted)
 
 
 def _mirrored(output: Path, name: str) -> ResultFiles:
     """Where the results of the file `name` of a folder go."""
-    motion = output / "motions" / name
-    if motion.suffix.lower() != ".npz":
-        motion = motion.with_name(f"{motion.name}.npz")
+    if not name.lower().endswith(".npz"):
+        name = f"{name}.npz"
     report = output / "reports" / name
     return ResultFiles(
-        motion=motion,
-        vertices=output / "vertices" / motion.relative_to(output / "motions"),
+        motion=output / "motions" / name,
+        vertices=output / "vertices" / name,
         frames=report.with_suffix(".frames.npz"),
         report=report.with_suffix(".json"),
         picture=report.with_suffix(".png"),
