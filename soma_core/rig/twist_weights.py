@@ -14,11 +14,11 @@ __all__ = ["fold_weights", "spread_weights"]
 
 _SMOOTHING = 0.1
 """Half width, as a share of the bone, over which the hat functions of the helpers are averaged. Removes the
-ring that piecewise linear weights leave at each helper of a strongly twisted thigh; wider costs more influences
-and thins the limb."""
+ring that piecewise linear weights leave at each helper of a strongly twisted thigh; a wider one thins the
+limb and costs influences."""
 
 _LEAST = 0.002
-"""Shares below this are dropped: at a twist of 150 degrees they move skin by less than 0.1 mm."""
+"""Taken from every share, so that the smallest vanish: fewer influences, and skin moves by 0.1 mm at most."""
 
 _SIGNIFICAND = 24  # bits of a float32, the implicit one included
 _SMALLEST = 2.0**-149  # smallest float32; the rig holds weights that small
@@ -38,8 +38,7 @@ def _shares(position: np.ndarray, nodes: Sequence[float]) -> np.ndarray:
         before, after = (_ramp_integral(end, low, high) for end in ends)
         passed.append((after - before) / (2 * _SMOOTHING))
     passed.append(np.zeros_like(position))
-    shares = -np.diff(np.stack(passed, 1), axis=1)
-    shares[shares < _LEAST] = 0
+    shares = np.maximum(-np.diff(np.stack(passed, 1), axis=1) - _LEAST, 0)
     return shares / shares.sum(axis=1, keepdims=True)
 
 
