@@ -14,6 +14,7 @@ from soma_core.errors import InputError
 from soma_core.geometry.rotations import matrix_to_axis_angle
 from soma_core.inversion._inputs import check_weights
 from soma_core.layer import Kernels
+from soma_core.native.blend import BlendMoments
 from soma_core.native.model import NativeBody, NativeRig
 from soma_core.native.motion import NativeMotion
 from soma_core.native.poses import PoseFit
@@ -151,7 +152,8 @@ class NativeFit(torch.nn.Module):
         spread = torch.linspace(0, len(vertices) - 1, min(frames, len(vertices))).round().long()
         target, counted = self._native(vertices[spread]), self._weights(weights)
         begin = self._one_body(start)
-        target, _, known = _finite(self._body(begin), target, counted)
+        first = self._prepared(begin, counted)
+        target, _, known = _finite(first.body, target, counted)
         if not bool(known.any()):
             raise InputError(
                 "vertices",
@@ -172,7 +174,7 @@ class NativeFit(torch.nn.Module):
             return self.rig.bodies(rest, joints)
 
         point = fit_shape(
-            lambda point: self._prepared(named(point[None]), counted),
+            lambda point: self._prepared(named(point[None]), counted, first.blend),
             directions,
             torch.cat([value.flatten() for value in begin.values()]),
             target[known.any(1)],
@@ -210,9 +212,13 @@ class NativeFit(torch.nn.Module):
         identity = self.rig.bodies(model.rest, model.joints)
         return NativeBody(params=params, identity=identity, pelvis=identity.bind_world[0, 1, :3, 3])
 
-    def _prepared(self, params: Mapping[str, Tensor], weights: Tensor) -> PoseFit:
-        body = self._body(params)
-        return PoseFit(self.rig, body, weights, iterations=self.iterations, tolerance=self.tolerance)
+    def _prepared(
+        self, params: Mapping[str, Tensor], weights: Tensor, blend: BlendMoments | None = None
+    ) -> PoseFit:
+        return PoseFit(
+            self.rig, self._body(params), weights, iterations=self.iterations, tolerance=self.tolerance,
+            blend=blend,
+        )  # fmt: skip
 
     def _fit(self, fit: PoseFit, target: Tensor) -> NativeMotion:
         """Fit a chunk of frames (F, n, 3) [m]."""

@@ -28,33 +28,40 @@ class PoseFit:
         weights: (n,) of its vertices.
         iterations: largest number of steps under the whole model.
         tolerance: a frame rests once a step changed its energy by less, as a root mean square [m].
+        blend: moments of the blend shapes of a similar body under the same weights, which save making
+            those of this one: steps depend on them, the minimum does not.
 
     Attributes:
         rest: moments of the body without blend shapes.
         body, weights: as given.
+        blend: moments of the blend shapes; None where there are none.
     """
 
     def __init__(
-        self, rig: NativeRig, body: NativeBody, weights: Tensor, *, iterations: int, tolerance: float
+        self,
+        rig: NativeRig,
+        body: NativeBody,
+        weights: Tensor,
+        *,
+        iterations: int,
+        tolerance: float,
+        blend: BlendMoments | None = None,
     ) -> None:
         self.rig, self.body, self.weights = rig, body, weights
         self._iterations, self._tolerance = iterations, tolerance
         offsets = rig.animation.bone_vectors(body.identity)
         self.rest = rig.moments.rest(body.identity, weights[None], offsets)
-        self._blend = None
-        if rig.blended and iterations:
-            self._blend = BlendMoments(rig.blend_shapes, rig.moments, self.rest, weights)
+        self.blend = blend
+        if rig.blended and iterations and blend is None:
+            self.blend = BlendMoments(rig.blend_shapes, rig.moments, self.rest, weights)
 
-    def __call__(self, target: Tensor, start: Pose | None = None) -> Pose:
-        """Poses for finite targets (F, n, 3) [m]; translations are places of the root joint.
-
-        `start` replaces the fit of the skinning alone.
-        """
-        pose = start or self._skinned(target)
-        if self._blend is None:
+    def __call__(self, target: Tensor) -> Pose:
+        """Poses for finite targets (F, n, 3) [m]; translations are places of the root joint."""
+        pose = self._skinned(target)
+        if self.blend is None:
             return pose
         whole = Refinement(
-            rig=self.rig, body=self.body, rest=self.rest, blend=self._blend, target=target,
+            rig=self.rig, body=self.body, rest=self.rest, blend=self.blend, target=target,
             weights=self.weights,
         )  # fmt: skip
         return whole(pose, iterations=self._iterations, tolerance=self._tolerance)

@@ -91,7 +91,7 @@ class NativeTransfer(torch.nn.Module):
         frame = native_to_canonical(spec.up, spec.forward).T / METRES[spec.unit]
 
         def keep(name: str, array: np.ndarray) -> None:
-            tensor = torch.as_tensor(np.ascontiguousarray(array), device=device)
+            tensor = torch.tensor(array, device=device)
             self.register_buffer(
                 name, tensor.to(dtype) if tensor.is_floating_point() else tensor, persistent=False
             )

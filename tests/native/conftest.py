@@ -1,0 +1,67 @@
+"""A data folder with a stand-in for SMPL-X, converted and wrapped as a user's would be."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import torch
+from soma_backend_smpl import smplx
+
+from soma_core import SomaLayer, read_motion
+from soma_core.native import NativeFit
+from soma_core.paths import assets_dir
+from soma_core.plugin.registry import Registry
+from tests.standins.smpl_files import smpl_arrays, write_npz, write_smpl_wrap
+
+FRAMES = (0, 90, 170, 260)
+BETAS = (0.8, -0.5, 0.4, 0.3)
+
+
+@pytest.fixture(scope="session")
+def smplx_registry(tmp_path_factory):
+    """A registry whose smplx reads the stand-in, as long as the tests of this folder run."""
+    root: Path = tmp_path_factory.mktemp("data")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("SOMA_DATA_DIR", str(root))
+        official = write_npz(root / "official" / "SMPLX_NEUTRAL.npz", smpl_arrays("smplx", width=20))
+        smplx.soma_convert(official, None)
+        write_smpl_wrap(root, "smplx")
+        registry = Registry()
+        registry.spec("smplx")
+        yield registry
+
+
+@pytest.fixture(scope="session")
+def layer(smplx_registry):
+    """SMPL-X on the canonical mesh."""
+    return SomaLayer("smplx", registry=smplx_registry)
+
+
+@pytest.fixture(scope="session")
+def body(layer):
+    """One body of it."""
+    return layer.identity({"betas": torch.tensor([BETAS])})
+
+
+@pytest.fixture(scope="session")
+def vertices(layer, body):
+    """Canonical vertices of four frames of the shipped motion, hands and fingers included."""
+    motion = read_motion(assets_dir() / "motions" / "range_of_motion.npz")
+    rotations, translation = (
+        torch.as_tensor(one[list(FRAMES)]) for one in (motion.rotations, motion.translation)
+    )
+    with torch.no_grad():
+        return layer.pose(body, rotations, translation).vertices
+
+
+@pytest.fixture(scope="session")
+def fit(smplx_registry):
+    """The way back to SMPL-X."""
+    return NativeFit("smplx", registry=smplx_registry)
+
+
+@pytest.fixture(scope="session")
+def motion(fit, vertices):
+    """The four frames in parameters of SMPL-X, the body known."""
+    return fit(vertices, params={"betas": torch.tensor([BETAS])})
