@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+import scipy.sparse
 import torch
 from torch import Tensor
 
@@ -20,6 +21,7 @@ from soma_core.geometry.sparse import SparseRows
 from soma_core.paths import assets_dir
 from soma_core.rig.mesh import CanonicalMesh
 from soma_core.rig.skeleton import Rig
+from soma_core.topology.lod_transfer import offset_rows
 
 __all__ = ["Correctives", "find_correctives", "load_correctives"]
 
@@ -33,7 +35,7 @@ class Correctives(torch.nn.Module):
     Args:
         weights: as read from a checkpoint.
         rig: of the level of detail that comes out.
-        vertices: ids in the mid LOD of the vertices that come out.
+        outputs: (3 v, 3 V) from offsets of the mid LOD to those of the vertices that come out.
         dtype, device: of constants and results.
     """
 
@@ -41,7 +43,7 @@ class Correctives(torch.nn.Module):
         self,
         weights: CorrectiveWeights,
         rig: Rig,
-        vertices: np.ndarray,
+        outputs: scipy.sparse.csr_array,
         *,
         dtype: torch.dtype,
         device: torch.device | str,
@@ -49,8 +51,7 @@ class Correctives(torch.nn.Module):
         super().__init__()
         self.meta, self.use_tanh = weights.meta, weights.use_tanh
         self.features = PoseFeatures(rig, dtype=dtype, device=device)
-        columns = (3 * vertices.astype(np.int64)[:, None] + np.arange(3)).ravel()
-        second = weights.second.T.tocsr()[columns].tocsc()
+        second = (outputs @ weights.second.T).tocsc()
         used = np.flatnonzero(np.diff(second.indptr))  # activations that move anything
         self.first = SparseRows(weights.first.T.tocsr()[used], dtype=dtype, device=device)
         self.second = SparseRows(second[:, used].tocsr(), dtype=dtype, device=device)
@@ -116,7 +117,10 @@ def load_correctives(
         return None
     weights = read_weights(path)
     check_bind_pose(path, weights, rig)
-    if weights.vertex_count <= int(mesh.mid_ids.max()):
-        cause = f"moves {weights.vertex_count} vertices, this mesh has ids up to {int(mesh.mid_ids.max())}"
+    outputs = offset_rows(mesh)
+    least = outputs.shape[1] // 3
+    if weights.vertex_count < least:
+        cause = f"moves {weights.vertex_count} vertices, this mesh has ids up to {least - 1}"
         raise AssetError(path, cause=cause, fix="Train them for this mesh with `soma train-correctives`.")
-    return Correctives(weights, rig, mesh.mid_ids, dtype=dtype, device=device)
+    outputs.resize(outputs.shape[0], 3 * weights.vertex_count)
+    return Correctives(weights, rig, outputs, dtype=dtype, device=device)

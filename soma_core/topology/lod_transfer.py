@@ -9,15 +9,17 @@ from __future__ import annotations
 import hashlib
 
 import numpy as np
+import scipy.sparse
 import torch
 from torch import Tensor
 
 from soma_core.cache import cached_arrays, content_key
-from soma_core.geometry.barycentric import raised_normal
+from soma_core.geometry.barycentric import raised_normal, raised_normal_jacobian
+from soma_core.rig import load_canonical
 from soma_core.rig.mesh import CanonicalMesh
 from soma_core.topology.correspondence import Correspondence, build_correspondence
 
-__all__ = ["LodTransfer", "lod_correspondence"]
+__all__ = ["LodTransfer", "lod_correspondence", "offset_rows"]
 
 _CODE_VERSION = "1"
 
@@ -85,7 +87,26 @@ class LodTransfer(torch.nn.Module):
         plane = torch.einsum("nk,bnkc->bnc", self.shares, corners)
         return plane + self.height[:, None] * raised_normal(corners)
 
-    def offsets(self, vertices: Tensor, offsets: Tensor) -> Tensor:
-        """What `offsets` of the source vertices, both (B, v, 3), move the target vertices by, (B, t, 3)."""
-        before = vertices[:, self.source_ids]
-        return self.from_needed(before + offsets[:, self.source_ids]) - self.from_needed(before)
+
+def offset_rows(mesh: CanonicalMesh) -> scipy.sparse.csr_array:
+    """Matrix (3 v, 3 m) that takes small offsets of mid vertices to those of a level of detail.
+
+    Rows and columns are ``3 * vertex + axis``, up to the last mid vertex that counts. For mid and low it
+    selects rows; for xlo it is the derivative of :class:`LodTransfer` at the bind shape.
+    """
+    axes = np.arange(3)
+    if mesh.lod != "xlo":
+        columns = (3 * mesh.mid_ids.astype(np.int64)[:, None] + axes).ravel()
+        entries = (np.ones(len(columns)), (np.arange(len(columns)), columns))
+        return scipy.sparse.csr_array(entries)
+    low = load_canonical("low")[0]
+    found = lod_correspondence(low, mesh)
+    first, second, height = found.coordinates.T
+    shares = np.stack([1 - first - second, first, second], 1)
+    slope = height[:, None, None, None] * raised_normal_jacobian(low.vertices[found.corners])
+    slope += np.einsum("nk,ij->nikj", shares, np.eye(3))
+    rows = np.broadcast_to(np.arange(3 * len(height)).reshape(-1, 3, 1, 1), slope.shape)
+    corners = low.mid_ids[found.corners].astype(np.int64)
+    columns = np.broadcast_to((3 * corners[:, :, None] + axes)[:, None], slope.shape)
+    entries = (slope.ravel(), (rows.ravel(), columns.ravel()))
+    return scipy.sparse.csr_array(entries)
