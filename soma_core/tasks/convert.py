@@ -22,7 +22,7 @@ __all__ = ["run"]
 
 _log = logging.getLogger(__name__)
 
-_FAILED, _SKIPPED = "failed", "skipped"
+_CONVERTED, _SKIPPED, _FAILED = "converted", "skipped", "failed"
 
 
 def run(config: DictConfig, output: Path) -> None:
@@ -82,7 +82,8 @@ def _convert_folder(config: DictConfig, folder: Path, output: Path) -> None:
         _log.log(level, "%d of %d: %s: %s", number, len(files), name, told)
         _write_rows(output / "report.json", folder, rows)
     counts = Counter(row["state"] for row in rows.values())
-    _log.info("%s: %s", folder, ", ".join(f"{count} {state}" for state, count in counts.items()))
+    told = [f"{counts[state]} {state}" for state in (_CONVERTED, _SKIPPED, _FAILED) if counts[state]]
+    _log.info("%s: %s", folder, ", ".join(told))
     if counts[_SKIPPED] == counts.total():
         raise InputError(
             str(folder), got=f"{counts.total()} files without a motion", expected="motion files",
@@ -116,7 +117,7 @@ def _row(
         errors.append(error)
         return {"state": _FAILED, "reason": str(error)}, str(error)
     report = converted.report
-    row = {"state": "converted", "layout": report["settings"]["layout"], "frames": report["frames"],
+    row = {"state": _CONVERTED, "layout": report["settings"]["layout"], "frames": report["frames"],
            "fps": report["settings"]["fps"], "error_mm": converted.error_mm}  # fmt: skip
     return row, str(converted)
 

@@ -1,0 +1,139 @@
+"""``soma convert`` from the command line: a file, a folder that is mirrored, and what stands in the way."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+
+from soma_core.cli import EXIT_FAILED, EXIT_OK, main
+from soma_core.errors import InputError
+from soma_core.io import read_motion, write_motion
+from soma_core.tasks import convert
+from tests.tasks.test_convert_file import configured, motion
+
+
+@pytest.fixture
+def folder(tmp_path, amass):
+    """Motions of three kinds at two depths, a file without a motion, one that is cut off, one hidden."""
+    root = tmp_path / "in"
+    (root / "CMU/01").mkdir(parents=True)
+    np.savez(root / "CMU/01/walk_poses.npz", **amass)
+    np.savez(root / "CMU/01/shape.npz", betas=np.zeros(16), gender="female")
+    np.savez(root / "k.npz", local_rot_mats=motion().rotations, root_positions=np.zeros((3, 3)))
+    write_motion(motion(), root / "ours.npz")
+    (root / "cut.npz").write_bytes((root / "k.npz").read_bytes()[:2000])
+    (root / ".hidden.npz").write_bytes(b"x")
+    (root / "note.txt").write_text("x")
+    return root
+
+
+def files_of(folder):
+    return sorted(path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file())
+
+
+def test_a_folder_is_mirrored(smplh_models, folder, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    command = ["convert", "input=in", "out=made", "lod=low", "picture.frames=0"]
+    assert main(command) == EXIT_FAILED
+    streams = capsys.readouterr()
+    assert "5 of 5: ours.npz: soma, 3 frames at 24 fps, rotations carried over" in streams.err
+    assert "in: 3 converted, 1 skipped, 1 failed" in streams.err
+    assert "1 of 5 files could not be converted" in streams.err
+    assert "cut.npz: not an NPZ file" in streams.err
+    motions = ["CMU/01/walk_poses.npz", "k.npz", "ours.npz"]
+    assert files_of(tmp_path / "made/motions") == motions
+    assert files_of(tmp_path / "made/reports") == [
+        "CMU/01/walk_poses.frames.npz",
+        "CMU/01/walk_poses.json",
+        "k.json",
+        "ours.json",
+    ]
+    for name in motions:
+        assert read_motion(tmp_path / "made/motions" / name).frame_count in (3, 6)
+    rows = json.loads((tmp_path / "made/report.json").read_text())["files"]
+    states = {name: row["state"] for name, row in rows.items()}
+    assert states == dict.fromkeys(motions, "converted") | {
+        "CMU/01/shape.npz": "skipped",
+        "cut.npz": "failed",
+    }
+    assert rows["CMU/01/walk_poses.npz"]["error_mm"]["mean"] > 0
+    assert "not an NPZ file" in rows["cut.npz"]["reason"]
+    (folder / "cut.npz").unlink()
+    assert main(command) == EXIT_OK
+    streams = capsys.readouterr()
+    assert streams.out.splitlines()[-1] == "made"
+    assert "mm (by an earlier run)" in streams.err
+    assert not (tmp_path / "made/chunks").exists()
+
+
+def test_results_inside_the_input_are_not_converted_again(folder, tmp_path):
+    for name in ("cut.npz", "CMU/01/walk_poses.npz"):
+        (folder / name).unlink()
+    for _ in range(2):
+        convert.run(configured(input=str(folder)), folder / "made")
+    rows = json.loads((folder / "made/report.json").read_text())["files"]
+    assert sorted(rows) == ["CMU/01/shape.npz", "k.npz", "ours.npz"]
+
+
+def test_files_of_one_name_and_two_suffixes_stay_apart(tmp_path):
+    made = [convert._mirrored(tmp_path, name) for name in ("a/b.npz", "a/b.parquet")]
+    assert made[0].motion == tmp_path / "motions/a/b.npz"
+    assert made[1].motion == tmp_path / "motions/a/b.parquet.npz"
+    assert made[0].report != made[1].report
+
+
+@pytest.mark.parametrize(
+    ("content", "said"),
+    [
+        ({}, "got no file ending in .npz or .parquet, expected motion files"),
+        ({"a.npz": {"betas": 1}}, "got 1 files without a motion"),
+        ({"a.npz": {"poses": 1, "trans": 1}}, r"a\.npz: poses: got shape \(\)"),
+    ],
+)
+def test_a_folder_without_a_motion_is_refused(tmp_path, content, said):
+    for name, keys in content.items():
+        np.savez(tmp_path / name, **keys)
+    with pytest.raises(InputError, match=said):
+        convert.run(configured(input=str(tmp_path)), tmp_path / "out")
+
+
+@pytest.mark.parametrize(
+    ("overrides", "said"),
+    [
+        (["input=none.npz"], "none.npz: file is missing"),
+        ([], "input: got none, expected a motion file, or a folder of them"),
+        (["input=m.npz", "chunk=0"], "chunk: got 0, expected at least 1"),
+        (["input=m.npz", "gender=x"], "gender: "),
+        (["input=m.npz", "to=smplz"], "smplz"),
+    ],
+)
+def test_what_cannot_be_run_says_why(tmp_path, monkeypatch, capsys, overrides, said):
+    monkeypatch.chdir(tmp_path)
+    write_motion(motion(identity={"backend": "soma", "params": {}}), tmp_path / "m.npz")
+    assert main(["convert", *overrides]) not in (EXIT_OK, None)
+    assert said in capsys.readouterr().err
+
+
+def test_one_file_from_the_command_line(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    write_motion(motion(), tmp_path / "m.npz")
+    assert main(["convert", "input=m.npz", "out=made"]) == EXIT_OK
+    streams = capsys.readouterr()
+    assert streams.out == "made\n"
+    assert "m.npz: soma, 3 frames at 24 fps, rotations carried over" in streams.err
+    assert {"config.yaml", "environment.json", "motion.npz", "report.json"} <= {*files_of(tmp_path / "made")}
+    assert main(["convert", "input=m.npz"]) == EXIT_OK
+    assert capsys.readouterr().out.startswith("outputs/convert/")
+
+
+def test_a_stopped_run_says_how_to_go_on(tmp_path, monkeypatch, caplog):
+    def stop(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(convert.Converter, "__call__", stop)
+    write_motion(motion(), tmp_path / "m.npz")
+    with pytest.raises(KeyboardInterrupt):
+        convert.run(configured(input=str(tmp_path / "m.npz")), tmp_path / "out")
+    assert f"stopped; the same command with out={tmp_path / 'out'} goes on from here" in caplog.text
