@@ -304,12 +304,13 @@ class TrainShapeConfig:
 
 @dataclass
 class Experiment:
-    """What an evaluation measures, on which backend, over how many identities or frames, by which methods."""
+    """What an evaluation measures: backend, number of identities or frames, methods, folder of outside data."""
 
     name: str = MISSING
     backend: str = MISSING
     count: int = 100
     methods: list[str] = field(default_factory=list)
+    data: str | None = None
 
 
 @dataclass

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-__all__ = ["Figure", "Report", "Table", "distance_figures"]
+__all__ = ["Figure", "Report", "ShownBody", "Table", "distance_figures"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -63,6 +63,23 @@ def _cell(value: str | float | None) -> str:
     return f"{value:,.0f}" if abs(value) >= 1000 else f"{value:.4g}"
 
 
+@dataclass(frozen=True, kw_only=True, eq=False)
+class ShownBody:
+    """One body of the picture of an experiment.
+
+    Attributes:
+        caption: text below it; a second line is drawn smaller.
+        vertices: (v, 3) [m], +Y up.
+        triangles: (t, 3) vertex ids.
+        errors_mm: (v,) error of each vertex [mm], by which it is coloured; NaN where there is none.
+    """
+
+    caption: str
+    vertices: np.ndarray
+    triangles: np.ndarray
+    errors_mm: np.ndarray
+
+
 @dataclass(frozen=True, kw_only=True)
 class Report:
     """All figures of one experiment.
@@ -72,12 +89,14 @@ class Report:
         figures: in the order a reader wants them.
         notes: sentences that explain the figures.
         tables: what is compared but not held to a bound; shown before the figures.
+        bodies: what is worth looking at; drawn as ``errors.png``.
     """
 
     title: str
     figures: Sequence[Figure]
     notes: Sequence[str] = field(default_factory=tuple)
     tables: Sequence[Table] = field(default_factory=tuple)
+    bodies: Sequence[ShownBody] = field(default_factory=tuple)
 
     @property
     def failed(self) -> list[Figure]:

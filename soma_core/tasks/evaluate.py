@@ -19,13 +19,13 @@ _log = logging.getLogger(__name__)
 
 EXPERIMENTS = (
     "table1_topology", "table2_inversion", "table3_regions", "unknown_identity", "forward_path",
-    "anny_reference",
+    "anny_reference", "sam3d_frames",
 )  # fmt: skip
 """Modules of ``soma_core.evaluation`` with a function ``run(config) -> Report``."""
 
 
 def run(config: DictConfig, output: Path) -> None:
-    """Run `config.experiment.name`; write ``report.json`` and ``report.md`` into `output`.
+    """Run `config.experiment.name`; write ``report.json``, ``report.md`` and any picture into `output`.
 
     Raises:
         InputError: no such experiment.
@@ -46,6 +46,24 @@ def run(config: DictConfig, output: Path) -> None:
     document = json.dumps(report.as_json(), indent=2) + "\n"
     atomic_write(output / "report.json", lambda path: path.write_text(document, encoding="utf-8") and None)
     atomic_write(output / "report.md", lambda path: path.write_text(text, encoding="utf-8") and None)
+    _draw(output / "errors.png", report)
     if report.failed:
         worst = "; ".join(f"{f.name} is {f.value:.4g} {f.unit}, bound {f.bound:g}" for f in report.failed)
         raise SomaError(f"{name}: {worst}. See {output / 'report.md'}")
+
+
+def _draw(path: Path, report: Report) -> None:
+    """Draw the bodies of a report, if it has any; without pyvista there is no picture, and that is said."""
+    if not report.bodies:
+        return
+    from soma_core.tasks.error_picture import error_sheet
+    from soma_core.tasks.stage import Body
+
+    bodies = [
+        Body(vertices=body.vertices, triangles=body.triangles, colour=(0.8, 0.8, 0.8), caption=body.caption)
+        for body in report.bodies
+    ]
+    try:
+        error_sheet(path, bodies, [body.errors_mm for body in report.bodies])
+    except SomaError as error:
+        _log.warning("no picture: %s", error)

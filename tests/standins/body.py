@@ -14,7 +14,7 @@ from soma_core.geometry.barycentric import closest_point_on_triangle
 from soma_core.testing.synthetic import write_obj
 from soma_core.topology.closest import ClosestFaces
 
-__all__ = ["Body", "make_body", "write_wrap"]
+__all__ = ["Body", "make_body", "surface_wrap", "write_wrap"]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -77,15 +77,19 @@ def make_body(count: int, face_count: int, components: int = 16) -> Body:
     )
 
 
-def write_wrap(folder: Path, body: Body, scale: float = 1.0) -> None:
-    """Write ``SOMA_wrap.obj``: the canonical mid mesh on the facets of the body, its bags apart."""
+def surface_wrap(body: Body) -> np.ndarray:
+    """The canonical mid mesh on the facets of the body, its bags apart, (v, 3) [m]."""
     layer = SomaLayer("soma", dtype=torch.float64, kernels="torch", procedural=False)
     with torch.no_grad():
         still = torch.zeros(1, len(layer.joint_names), 3, dtype=torch.float64)
         ideal = layer.pose(layer.identity(), still).vertices[0].numpy()
-    mesh = layer.mesh
     face = ClosestFaces(body.vertices, body.faces).query(ideal)
     wrap = closest_point_on_triangle(ideal, body.vertices[body.faces[face]])
-    wrap[mesh.face_interior] = ideal[mesh.face_interior]
+    wrap[layer.mesh.face_interior] = ideal[layer.mesh.face_interior]
+    return wrap
+
+
+def write_wrap(folder: Path, body: Body, scale: float = 1.0) -> None:
+    """Write it as ``SOMA_wrap.obj``."""
     folder.mkdir(parents=True, exist_ok=True)
-    write_obj(folder / "SOMA_wrap.obj", scale * wrap, mesh.triangles)
+    write_obj(folder / "SOMA_wrap.obj", scale * surface_wrap(body), load_canonical("mid")[0].triangles)

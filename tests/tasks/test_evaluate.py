@@ -9,9 +9,9 @@ from omegaconf import OmegaConf
 
 from soma_core.errors import InputError, SomaError
 from soma_core.evaluation.random_poses import joint_spread, random_axis_angles
-from soma_core.evaluation.report import Figure, Report, distance_figures
+from soma_core.evaluation.report import Figure, Report, ShownBody, distance_figures
 from soma_core.rig import load_canonical
-from soma_core.tasks import evaluate
+from soma_core.tasks import error_picture, evaluate
 
 
 def configured(name, count=2):
@@ -34,6 +34,30 @@ def test_a_figure_outside_its_bound_fails_after_the_reports(tmp_path, monkeypatc
     with pytest.raises(SomaError, match=r"forward_path: drift is (2|nan) mm, bound 1"):
         evaluate.run(configured("forward_path"), tmp_path)
     assert "FAILED" in (tmp_path / "report.md").read_text(encoding="utf-8")
+
+
+def shown():
+    corners = np.eye(3)
+    return ShownBody(caption="one", vertices=corners, triangles=np.array([[0, 1, 2]]), errors_mm=np.ones(3))
+
+
+@pytest.mark.parametrize("drawable", [True, False])
+def test_the_bodies_of_a_report_are_drawn_where_they_can_be(tmp_path, monkeypatch, caplog, drawable):
+    def sheet(path, bodies, errors):
+        if not drawable:
+            raise SomaError("pictures need pyvista")
+        path.write_text(f"{bodies[0].caption} {errors[0].tolist()}")
+
+    report = Report(title="Made up", figures=[], bodies=[shown()])
+    monkeypatch.setattr(
+        evaluate.importlib, "import_module", lambda name: SimpleNamespace(run=lambda _: report)
+    )
+    monkeypatch.setattr(error_picture, "error_sheet", sheet)
+    evaluate.run(configured("forward_path"), tmp_path)
+    picture = tmp_path / "errors.png"
+    assert picture.exists() == drawable
+    assert ("no picture: pictures need pyvista" in caplog.text) != drawable
+    assert not drawable or picture.read_text() == "one [1.0, 1.0, 1.0]"
 
 
 def test_an_unknown_experiment_is_refused(tmp_path):
