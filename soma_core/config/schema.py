@@ -304,7 +304,7 @@ class TrainShapeConfig:
 
 @dataclass
 class Experiment:
-    """What an evaluation measures: backend, number of identities or frames, methods, folder of outside data."""
+    """What an evaluation measures: on what backend, how many bodies or frames, which methods and files."""
 
     name: str = MISSING
     backend: str = MISSING
