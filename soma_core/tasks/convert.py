@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import logging
+import shutil
 from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
@@ -81,6 +82,7 @@ def _convert_folder(config: DictConfig, folder: Path, output: Path) -> None:
         level = logging.WARNING if rows[name]["state"] == _FAILED else logging.INFO
         _log.log(level, "%d of %d: %s: %s", number, len(files), name, told)
         _write_rows(output / "report.json", folder, rows)
+    shutil.rmtree(output / "chunks", ignore_errors=True)
     counts = Counter(row["state"] for row in rows.values())
     told = [f"{counts[state]} {state}" for state in (_CONVERTED, _SKIPPED, _FAILED) if counts[state]]
     _log.info("%s: %s", folder, ", ".join(told))
