@@ -15,9 +15,10 @@ from soma_backend_smpl._model_file import read_model
 from soma_backend_smpl.family import SMPL
 
 from soma_core.backends.native import component_count
-from soma_core.io import open_vertex_sequence, read_motion
+from soma_core.io import open_vertex_sequence, read_amass, read_motion
 from soma_core.io.mesh_vertices import read_mesh_vertices
 from soma_core.io.pickled_arrays import read_pickled_arrays
+from soma_core.io.sam3d import read_sam3d
 from soma_core.rig.legacy import read_legacy_rig
 from soma_core.rig.manifest import MANIFEST_NAME, read_manifest
 from soma_core.rig.neutral import load_shape_space, read_topology
@@ -84,6 +85,13 @@ def _motion(path: Path) -> None:
 def _kimodo(path: Path) -> None:
     turns = np.tile(np.eye(3, dtype=np.float32), (FRAMES, 30, 1, 1))
     _write_npz(path, local_rot_mats=turns, root_positions=turns[:, 0, 0])
+
+
+def _amass(path: Path) -> None:
+    _write_npz(
+        path, poses=np.zeros((FRAMES, 156)), trans=np.zeros((FRAMES, 3)), betas=np.zeros(16),
+        gender=np.array("male"), mocap_framerate=120.0,
+    )  # fmt: skip
 
 
 def _shape_space(path: Path) -> None:
@@ -222,6 +230,7 @@ READERS = [
     Reader(name="vertices usdz", suffix=".usdz", read=_frames),
     Reader(name="motion", suffix=".npz", read=read_motion, good=_motion),
     Reader(name="kimodo motion", suffix=".npz", read=read_motion, good=_kimodo),
+    Reader(name="sam 3d body", suffix=".npz", read=read_sam3d),
     Reader(name="shape space", suffix=".npz", read=load_shape_space, good=_shape_space),
     Reader(
         name="shape space header", suffix=".npz", read=component_count, good=_shape_space,
