@@ -17,6 +17,8 @@ __all__ = [
     "BenchConfig",
     "BodyGender",
     "ConvertConfig",
+    "ConvertResult",
+    "CorrectivesData",
     "EvaluateConfig",
     "Experiment",
     "FitLod",
@@ -34,6 +36,7 @@ __all__ = [
     "PriorChoice",
     "Product",
     "Topology",
+    "TrainCorrectivesConfig",
     "TrainShapeConfig",
     "Translation",
     "Upward",
@@ -48,6 +51,13 @@ class BodyGender(StrEnum):
     neutral = "neutral"
     male = "male"
     female = "female"
+
+
+class ConvertResult(StrEnum):
+    """What the way back gives: pose parameters of the model, or vertices."""
+
+    poses = "poses"
+    vertices = "vertices"
 
 
 class Gallery(StrEnum):
@@ -269,6 +279,7 @@ class ConvertConfig:
     input: str | None = None
     out: str = MISSING
     to: str = "soma"
+    result: ConvertResult | None = None
     fps: float | None = None
     unit: LengthUnit | None = None
     up: Upward | None = None
@@ -296,6 +307,40 @@ class TrainShapeConfig:
     batch: int = 256
     mirror: bool = True
     held_out: int = 200
+    resume: bool = False
+    seed: int = 0
+    device: str = "cpu"
+    out: str | None = None
+
+
+@dataclass
+class CorrectivesData:
+    """Poses that correctives are taught on: random clips, and every `step`-th frame of motion files."""
+
+    random_clips: int = 140
+    poses: int = 24
+    motions: list[str] = field(default_factory=list)
+    step: int = 10
+    mirror: bool = True
+    held_out: float = 0.1
+
+
+@dataclass
+class TrainCorrectivesConfig:
+    """Configuration of ``soma train-correctives``."""
+
+    teacher: str = "elastic"
+    data: CorrectivesData = field(default_factory=CorrectivesData)
+    channels: int = 24
+    reach: float = 1.5
+    lod: FitLod = FitLod.low
+    batch: int = 64
+    epochs: int = 60
+    rate: float = 0.003
+    sparsity: float = 0.01
+    patience: int = 8
+    ridge: float = 1e-4
+    mebibytes: float = 5.5
     resume: bool = False
     seed: int = 0
     device: str = "cpu"
@@ -360,6 +405,7 @@ def register_schemas() -> None:
         ("invert", InvertConfig),
         ("convert", ConvertConfig),
         ("train_shape", TrainShapeConfig),
+        ("train_correctives", TrainCorrectivesConfig),
         ("evaluate", EvaluateConfig),
         ("bench", BenchConfig),
         ("wrap", WrapConfig),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from soma_core.io.amass import SmplMotion, read_amass, write_amass
 from soma_core.io.clip import SkinnedClip, skinned_clip
 from soma_core.io.gltf import write_gltf
 from soma_core.io.joint_order import USER_JOINTS
@@ -18,12 +19,15 @@ __all__ = [
     "Motion",
     "Sam3dFrames",
     "SkinnedClip",
+    "SmplMotion",
     "VertexSequence",
     "check_rig",
     "open_vertex_sequence",
+    "read_amass",
     "read_motion",
     "read_sam3d",
     "skinned_clip",
+    "write_amass",
     "write_gltf",
     "write_motion",
     "write_motion_parts",

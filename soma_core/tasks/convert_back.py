@@ -133,11 +133,16 @@ class BackConverter:
         """What becomes of the body; in the SMPL family it keeps the parameters that it has there."""
         config, name = self._config, str(self._config.to)
         kind = {"lod": str(config.lod), "device": config.device}
-        if name not in SMPL_JOINTS:
+        if str(config.result or _usual_result(name)) == "vertices":
             _refuse_for_vertices(config)
             if name not in self._targets:
                 self._targets[name] = NativeTransfer(name, **kind)
             return VertexTarget(transfer=self._targets[name])
+        if name not in SMPL_JOINTS:
+            raise InputError(
+                "result", got=f"poses of {name}", expected=f"poses of one of {', '.join(SMPL_JOINTS)}",
+                fix="Pass result=vertices; in Python, NativeFit gives the poses of other skinned models.",
+            )  # fmt: skip
         own = stored if stored["backend"] == name and "rest" not in stored else {}
         gender = str(config.gender or own.get("options", {}).get("gender", "neutral"))
         params = {"betas": list(config.betas)} if config.betas is not None else own.get("params")
@@ -176,6 +181,10 @@ def _convert_missing(body: _MovingBody, target: NativeTarget, kept: FittedChunks
         kept.save(number, target.arrays(body.posed(slice(*kept.ranges[number]))))
 
 
+def _usual_result(name: str) -> str:
+    return "poses" if name in SMPL_JOINTS else "vertices"
+
+
 def _refuse_for_vertices(config: DictConfig) -> None:
     """Refuse what only pose parameters have."""
     for name in ("up", "gender", "betas"):
@@ -183,6 +192,6 @@ def _refuse_for_vertices(config: DictConfig) -> None:
             raise InputError(
                 name,
                 got=str(config[name]),
-                expected=f"none: to={config.to} gives vertices in the axes of that model",
+                expected=f"none: vertices of {config.to} have the axes of that model",
                 fix=f"Leave {name} out.",
             )

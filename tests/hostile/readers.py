@@ -230,6 +230,7 @@ READERS = [
     Reader(name="vertices usdz", suffix=".usdz", read=_frames),
     Reader(name="motion", suffix=".npz", read=read_motion, good=_motion),
     Reader(name="kimodo motion", suffix=".npz", read=read_motion, good=_kimodo),
+    Reader(name="amass motion", suffix=".npz", read=read_amass, good=_amass),
     Reader(name="sam 3d body", suffix=".npz", read=read_sam3d),
     Reader(name="shape space", suffix=".npz", read=load_shape_space, good=_shape_space),
     Reader(

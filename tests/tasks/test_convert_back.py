@@ -124,7 +124,11 @@ def test_the_body_can_be_put_on_the_ground(tmp_path):
 @pytest.mark.parametrize(
     ("changes", "said"),
     [
-        ({"to": "toy", "up": "z"}, "up: got z, expected none: to=toy gives vertices"),
+        (
+            {"to": "toy", "result": "poses"},
+            "result: got poses of toy, expected poses of one of smpl, smplh, smplx",
+        ),
+        ({"to": "toy", "up": "z"}, "up: got z, expected none: vertices of toy have the axes of that model"),
         ({"to": "toy", "gender": "male"}, "gender: got male, expected none"),
         ({"to": "toy", "betas": [1.0]}, r"betas: got \[1\.0\], expected none"),
     ],
