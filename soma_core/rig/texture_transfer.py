@@ -57,13 +57,24 @@ def transfer_texture(
 
 
 def _nearby(targets: np.ndarray, sources: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Pairs (target, source) in ascending order: the sources around each target, at least one."""
+    """Pairs (target, source) in ascending order: the sources around each target that face its way.
+
+    Without the rest of a limb, the two sides of a seam along it are not joined around its back.
+    """
     middles, centres = targets.mean(axis=1), cKDTree(sources.mean(axis=1))
     radius = np.linalg.norm(targets - middles[:, None], axis=2).max(axis=1)
-    radius = np.maximum(_REACH * radius, centres.query(middles)[0] * (1 + 1e-9))
-    found = centres.query_ball_point(middles, radius, return_sorted=True)
+    distance, nearest = centres.query(middles)
+    found = centres.query_ball_point(middles, np.maximum(_REACH * radius, distance * (1 + 1e-9)))
     target = np.repeat(np.arange(len(targets)), [len(ids) for ids in found])
-    return target, np.concatenate([np.array(ids, np.int64) for ids in found])
+    source = np.concatenate([np.sort(ids) for ids in found]).astype(np.int64)
+    facing = np.einsum("nc,nc->n", _normals(targets)[target], _normals(sources)[source]) > 0
+    kept = facing | (source == nearest[target])
+    return target[kept], source[kept]
+
+
+def _normals(triangles: np.ndarray) -> np.ndarray:
+    """Normals (t, 3) of any length."""
+    return np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
 
 
 def _seamless(target: np.ndarray, source: np.ndarray, uv_faces: np.ndarray) -> scipy.sparse.csr_array:

@@ -38,7 +38,10 @@ def edges(triangles: np.ndarray) -> Counter:
     return Counter(map(tuple, pairs.tolist()))
 
 
-@pytest.mark.parametrize(("lod", "counts"), [("mid", (18056, 36108, 18054)), ("low", (4505, 9006, 4524))])
+@pytest.mark.parametrize(
+    ("lod", "counts"),
+    [("mid", (18056, 36108, 18054)), ("low", (4505, 9006, 4524)), ("xlo", (612, 1220, 1220))],
+)
 def test_counts(lod, counts):
     mesh, rig = load_canonical(lod)
     assert (mesh.vertex_count, len(mesh.triangles), len(mesh.face_vert_counts)) == counts
@@ -48,7 +51,7 @@ def test_counts(lod, counts):
     assert mesh.uv_indices.max() == len(mesh.uv) - 1
 
 
-@pytest.mark.parametrize("lod", ["mid", "low"])
+@pytest.mark.parametrize("lod", ["mid", "low", "xlo"])
 def test_mesh_is_closed_oriented_and_of_genus_zero(lod):
     mesh, _ = load_canonical(lod)
     half = edges(mesh.triangles)
@@ -67,7 +70,7 @@ def test_low_mesh_has_the_edges_that_were_split(low):
     assert Counter(mesh.face_vert_counts.tolist()) == {4: 4482, 3: 42}
 
 
-@pytest.mark.parametrize("lod", ["mid", "low"])
+@pytest.mark.parametrize("lod", ["mid", "low", "xlo"])
 def test_triangles_tile_the_polygons(lod):
     mesh, _ = load_canonical(lod)
     starts = np.cumsum(mesh.face_vert_counts) - mesh.face_vert_counts
@@ -100,7 +103,7 @@ def test_low_uvs_are_those_of_mid_at_the_same_vertex(mid, low):
     assert all(tuple(uv) in seen[vertex] for vertex, uv in corners)
 
 
-@pytest.mark.parametrize("lod", ["mid", "low"])
+@pytest.mark.parametrize("lod", ["mid", "low", "xlo"])
 def test_mirror_is_an_involution_that_maps_faces_to_faces(lod):
     mesh, _ = load_canonical(lod)
     np.testing.assert_array_equal(mesh.mirror[mesh.mirror], np.arange(mesh.vertex_count))
@@ -130,14 +133,15 @@ def test_face_interior_is_one_mouth_bag_and_two_eye_bags(mid, low):
     assert len(low[0].face_interior) == 175
 
 
-@pytest.mark.parametrize("lod", ["mid", "low"])
+@pytest.mark.parametrize("lod", ["mid", "low", "xlo"])
 def test_segments_are_sorted_and_mirror_closed(lod):
     mesh, _ = load_canonical(lod)
     for name, ids in mesh.segments.items():
         assert ids.dtype == np.int32
         np.testing.assert_array_equal(ids, np.unique(ids), err_msg=name)
         np.testing.assert_array_equal(np.unique(mesh.mirror[ids]), ids, err_msg=name)
-        assert (len(ids) == 0) == (name in ("hair", "haircap")), name
+        empty = ("hair", "haircap", "mouth_bag", "eye_bags") if lod == "xlo" else ("hair", "haircap")
+        assert (len(ids) == 0) == (name in empty), name
 
 
 def test_segments_lie_where_their_names_say(mid):
