@@ -180,10 +180,8 @@ class ProceduralAnimation(Animation):
         self, identity: Identity, rotations: Tensor, positions: Tensor, bone_scale: Tensor | None
     ) -> Tensor:
         public = skinning_transforms(rotations, positions, identity.bind_world)
-        turns, places = self.twist(identity.bind_world, public[..., :3], positions, bone_scale)
-        bind = self.twist.bind_positions(identity.bind_world)
-        shift = places - (turns @ bind[..., None]).squeeze(-1)
-        return torch.cat((public, torch.cat((turns, shift[..., None]), -1)), 1)
+        helpers = self.twist(identity.bind_world, public[..., :3], positions, bone_scale)
+        return torch.cat((public, helpers), 1)
 
     def helper_transforms(
         self, identity: Identity, transforms: Tensor, bone_scale: Tensor | None = None
@@ -197,8 +195,7 @@ class ProceduralAnimation(Animation):
         """
         bind = identity.bind_world
         rotations, positions = transforms[..., :3, :3], transforms[..., :3, 3]
-        turns, places = self.twist(bind, rotations @ bind[..., :3, :3].mT, positions, bone_scale)
-        return to_homogeneous(turns @ self.twist.bind_rotations(bind), places)
+        return self.twist.world_transforms(bind, rotations @ bind[..., :3, :3].mT, positions, bone_scale)
 
 
 def _moved(rest: Tensor, offsets: Tensor | None) -> Tensor:

@@ -24,6 +24,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from soma_core.animation.kinematics import to_homogeneous
 from soma_core.geometry.rotations import matrix_to_quaternion, skew
 from soma_core.rig.procedural import ProceduralDefinition, TwistSegment
 from soma_core.rig.skeleton import Rig
@@ -134,8 +135,8 @@ class Twist(torch.nn.Module):
 
     def forward(
         self, bind_world: Tensor, turns: Tensor, positions: Tensor, bone_scale: Tensor | None = None
-    ) -> tuple[Tensor, Tensor]:
-        """Rotations from bind to posed (B, H, 3, 3) and posed positions (B, H, 3) [m] of the helpers.
+    ) -> Tensor:
+        """Skinning transforms ``G B^-1`` of the helpers, (B, H, 3, 4) [m].
 
         Args:
             bind_world: (B or 1, J, 4, 4) bind transforms of the identities [m].
@@ -143,16 +144,29 @@ class Twist(torch.nn.Module):
             positions: (B, J, 3) posed positions of the public joints [m].
             bone_scale: (B or 1, J - 1); a helper moves with the bone that leads to its end joint.
         """
-        places, rotations = bind_world[..., :3, 3], bind_world[..., :3, :3]
-        away = self.place @ places - places[:, self.start]
+        start = bind_world.index_select(1, self.start)
+        bind = self.bind_positions(bind_world)
+        away = bind - start[..., :3, 3]
         if bone_scale is not None:
             away = away * bone_scale[:, self.end_user, None]
-        axis = (rotations[:, self.start] @ self.axis[..., None]).squeeze(-1)
+        axis = start[..., :3, :3] @ self.axis[..., None]
         angle = (self.channels(bind_world, turns) @ self.mix.mT)[..., None, None]
-        cross = skew(axis)
-        spin = self.eye + torch.sin(angle) * cross + (1 - torch.cos(angle)) * (cross @ cross)
-        carried = turns[:, self.start]
-        return carried @ spin, positions[:, self.start] + (carried @ away[..., None]).squeeze(-1)
+        cosine = torch.cos(angle)
+        spin = cosine * self.eye + torch.sin(angle) * skew(axis.squeeze(-1)) + (1 - cosine) * (axis @ axis.mT)
+        carried = turns.index_select(1, self.start)
+        shift = carried @ (away[..., None] - spin @ bind[..., None])
+        placed = positions.index_select(1, self.start)[..., None] + shift
+        return torch.cat((carried @ spin, placed), -1)
+
+    def world_transforms(
+        self, bind_world: Tensor, turns: Tensor, positions: Tensor, bone_scale: Tensor | None = None
+    ) -> Tensor:
+        """World transforms (B, H, 4, 4) [m] of the helpers; takes what :meth:`forward` does."""
+        moved = self(bind_world, turns, positions, bone_scale)
+        rotation, bind = moved[..., :3], self.bind_positions(bind_world)[..., None]
+        return to_homogeneous(
+            rotation @ self.bind_rotations(bind_world), (rotation @ bind + moved[..., 3:]).squeeze(-1)
+        )
 
     def bind_positions(self, bind_world: Tensor) -> Tensor:
         """Positions of the helpers in the bind pose, (B, H, 3) [m], from (B, J, 4, 4)."""
@@ -164,7 +178,7 @@ class Twist(torch.nn.Module):
 
     def channels(self, bind_world: Tensor, turns: Tensor) -> Tensor:
         """Twist angles (B, K) [rad] of all channels in use."""
-        between = turns[:, self.reference].mT @ turns[:, self.joint]
+        between = turns.index_select(1, self.reference).mT @ turns.index_select(1, self.joint)
         aligned, local = self.counts[0], slice(self.counts[0], None)
         swing = slice(aligned, aligned + self.counts[1])
         parts = []
