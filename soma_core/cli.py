@@ -7,10 +7,10 @@ import importlib
 import os
 import sys
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from soma_core import __version__
 from soma_core.errors import InputError, SomaError
@@ -96,6 +96,7 @@ def _usage() -> str:
 
 def _run_task(name: str, overrides: Sequence[str]) -> int:
     from soma_core.config.compose import run_task
+    from soma_core.plugin.registry import default_registry
 
     row = TASKS[name]
     codes = [EXIT_OK]
@@ -107,8 +108,14 @@ def _run_task(name: str, overrides: Sequence[str]) -> int:
         else:
             _say(_shown(outcome))
 
-    run_task(row.load, config_name=row.module, program=f"soma {name}", overrides=overrides, report=report)
+    with default_registry().making_wraps(_make_missing_wrap):
+        run_task(row.load, config_name=row.module, program=f"soma {name}", overrides=overrides, report=report)
     return max(codes)
+
+
+def _make_missing_wrap(name: str, options: Mapping[str, Any]) -> None:
+    """Registration is imported when a backend lacks its wrap."""
+    importlib.import_module("soma_core.tasks.missing_wrap").make_missing_wrap(name, options)
 
 
 def _shown(folder: Path) -> str:

@@ -74,7 +74,8 @@ class NativeTransfer(torch.nn.Module):
             )
         registry = registry or default_registry()
         self.spec = spec = registry.spec(backend)
-        if spec.wrap is None:
+        pair = registry.wrap(backend)
+        if pair is None:
             raise InputError(
                 "backend",
                 got=backend,
@@ -83,7 +84,7 @@ class NativeTransfer(torch.nn.Module):
             )
         mid = load_canonical("mid")[0]
         with registry.isolated(backend, "wrap"):
-            forward = load_correspondence(spec.wrap, mid)
+            forward = load_correspondence(pair, mid)
         mesh = mid if lod == "mid" else load_canonical(lod)[0]
         back = _reverse(forward, mesh)
         self.canonical_count, self.count = mesh.vertex_count, forward.native_count

@@ -6,14 +6,15 @@ import functools
 import os
 import shlex
 import warnings
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from soma_core import __version__
-from soma_core.errors import AssetError, InputError
+from soma_core.errors import InputError
+from soma_core.plugin.causes import cause_and_fix, remedy, supply
 from soma_core.plugin.configs import PluginConfigs, find_configs
 from soma_core.plugin.declaration import checks_problem, did_you_mean, spec_problem
 from soma_core.plugin.discovery import CORE_DISTRIBUTION, EntryPointLike, Offer, find_offers
@@ -28,10 +29,10 @@ from soma_core.plugin.errors import (
     UnknownBackendError,
 )
 from soma_core.plugin.hooks import hook_manager
-from soma_core.plugin.installation import core_requirement, editable_folder, reinstall_command
+from soma_core.plugin.installation import core_requirement, reinstall_command
 from soma_core.plugin.known import KNOWN_BACKENDS, install_line, publication
 from soma_core.plugin.options import checked_options
-from soma_core.plugin.spec import API_VERSION, OLDEST_API_VERSION, BackendSpec, FileNeeded, Generator
+from soma_core.plugin.spec import API_VERSION, OLDEST_API_VERSION, BackendSpec, Generator, WrapPair
 
 if TYPE_CHECKING:
     import pluggy
@@ -39,9 +40,12 @@ if TYPE_CHECKING:
 
     from soma_core.testing import Check
 
-__all__ = ["Entry", "Registry", "State", "default_registry"]
+__all__ = ["Entry", "Registry", "State", "WrapMaker", "default_registry"]
 
 _CORE = f"{CORE_DISTRIBUTION} {__version__}"
+
+WrapMaker = Callable[[str, Mapping[str, Any]], None]
+"""Makes the wrap pair of a backend where its declaration names it."""
 
 State = Literal["found", "declared", "built", "blocked", "conflict", "broken"]
 
@@ -93,6 +97,7 @@ class Registry:
             text = os.environ.get("SOMA_BACKENDS", "")
             allowed = [name.strip() for name in text.split(",") if name.strip()]
         self._allowed = frozenset(allowed)
+        self._wrap_maker: WrapMaker | None = None
         self._records = {name: _Record(name, offers) for name, offers in find_offers(entry_points).items()}
         for record in self._records.values():
             self._settle(record)
@@ -161,6 +166,8 @@ class Registry:
         """
         spec = self.spec(name)
         record = self._records[name]
+        if wrapped:
+            self.wrap(name, options)
         self._check_files(record, spec, wrapped=wrapped)
         assert record.manager is not None
         with _isolated(record, "build"):
@@ -172,6 +179,34 @@ class Registry:
                 raise PluginError(f"soma_generator returned {type(generator).__name__} without a rest method")
         record.state, record.error = "built", None
         return generator
+
+    @contextmanager
+    def making_wraps(self, maker: WrapMaker) -> Iterator[None]:
+        """Within the context, wrap pairs that users have yet to make are made when they are needed.
+
+        `maker` is given the backend's name and options; registration takes minutes and belongs to no
+        constructor, so nothing is made outside of such a context.
+        """
+        before, self._wrap_maker = self._wrap_maker, maker
+        try:
+            yield
+        finally:
+            self._wrap_maker = before
+
+    def wrap(self, name: str, options: Mapping[str, Any] | None = None) -> WrapPair | None:
+        """Return the wrap pair of backend `name`, made first where it is missing and can be made.
+
+        Raises:
+            BackendError: the backend is not usable, or its pair cannot be made.
+        """
+        spec, record = self.spec(name), self._records[name]
+        pair = spec.wrap
+        ours_to_make = pair is not None and pair.wrap in {needed.path for needed in spec.files}
+        if self._wrap_maker is not None and pair and ours_to_make and not pair.wrap.is_file():
+            self._check_files(record, spec, wrapped=False)
+            with _isolated(record, "wrap"):
+                self._wrap_maker(name, options or {})
+        return pair
 
     def checks(self, name: str) -> tuple[Check, ...]:
         """Return the further conformance checks that the plugin of backend `name` gives; often none.
@@ -300,48 +335,12 @@ class Registry:
             with _isolated(record, "files"):
                 if not needed.path.exists():
                     raise PluginError(
-                        f"{needed.description or 'a file'} is missing at {needed.path}", fix=_supply(needed)
+                        f"{needed.description or 'a file'} is missing at {needed.path}", fix=supply(needed)
                     )
         for path in pair if wrapped else ():
             with _isolated(record, "wrap"):
                 if not path.is_file():
                     raise PluginError(f"the wrap pair names {path}, which does not exist")
-
-
-def _supply(needed: FileNeeded) -> str:
-    """How to come by a file that is missing."""
-    source = f"Get it from {needed.url}" if needed.url else ""
-    if needed.command:
-        return f"{source}, then run: {needed.command}" if source else f"Run: {needed.command}"
-    return f"Put the file there. {source}".strip()
-
-
-def _remedy(record: _Record, stage: Stage) -> str:
-    """What to do about a plugin that says nothing better itself."""
-    distribution = record.offers[0].distribution
-    checkout = editable_folder(distribution)
-    if stage == "rest":
-        todo = f"Compare the parameters with: soma backends show {record.name}"
-    elif checkout is None or stage == "import":  # an import often fails for want of another distribution
-        todo = f"Run: {reinstall_command(distribution)}"
-    else:
-        todo = f"Correct the plugin in {checkout}"
-    return f"{todo} (SOMA_STRICT=1 shows the whole traceback)"
-
-
-def _cause_and_fix(error: BaseException) -> tuple[str, str]:
-    """What an exception says: the core's own errors bring a fix along, others none."""
-    if isinstance(error, InputError):
-        return f"{error.argument}: got {error.got}, expected {error.expected}", error.fix
-    if isinstance(error, AssetError):
-        return f"{error.path}: {error.cause}", error.fix
-    if isinstance(error, BackendError | PluginError):
-        return error.cause, error.fix
-    try:
-        text = " ".join(str(error).split())
-    except Exception:  # an exception of the plugin's own, whose text cannot be made
-        text = ""
-    return f"{type(error).__name__}: {text}" if text else type(error).__name__, ""
 
 
 @contextmanager
@@ -358,11 +357,14 @@ def _isolated(record: _Record, stage: Stage) -> Iterator[None]:
         own_words = isinstance(error, PluginError)
         if about_the_call or (os.environ.get("SOMA_STRICT") == "1" and not own_words):
             raise
-        cause, fix = _cause_and_fix(error)
+        cause, fix = cause_and_fix(error)
         if stage != "files":  # a plugin is not to blame for what its user has yet to supply
             record.state = "broken"
         record.error = BrokenBackendError(
-            who=record.who, stage=stage, cause=cause.rstrip(". "), fix=fix or _remedy(record, stage)
+            who=record.who,
+            stage=stage,
+            cause=cause.rstrip(". "),
+            fix=fix or remedy(record.name, record.offers[0].distribution, stage),
         )
         raise record.error from (None if own_words else error)
 

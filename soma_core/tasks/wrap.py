@@ -5,31 +5,29 @@ from __future__ import annotations
 import json
 import logging
 import shutil
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import torch
 
-from soma_core.backends.parameters import batch_parameters
 from soma_core.cache import atomic_write
 from soma_core.errors import AssetError, InputError
 from soma_core.io.mesh_vertices import read_mesh_vertices
 from soma_core.plugin.registry import default_registry
-from soma_core.plugin.spec import HasTriangles, WrapPair
+from soma_core.plugin.spec import WrapPair
 from soma_core.registration.quality import Quality, measure
 from soma_core.registration.register import Registration, WrapOptions, register
 from soma_core.rig import load_canonical
 from soma_core.rig.mesh import CanonicalMesh
 from soma_core.tasks.animate import given_params
+from soma_core.tasks.neutral_mesh import NativeMesh, neutral_mesh
 from soma_core.topology.wrap_pair import read_obj
 
 if TYPE_CHECKING:
     from omegaconf import DictConfig
 
-__all__ = ["WRAP_FILE", "run", "write_pair"]
+__all__ = ["WRAP_FILE", "run", "write_pair", "write_report"]
 
 _log = logging.getLogger(__name__)
 
@@ -37,17 +35,6 @@ WRAP_FILE = "SOMA_wrap.obj"
 _AXES = ("+x", "-x", "+y", "-y", "+z", "-z")
 _DIGITS = {"m": 7, "cm": 5, "mm": 4}
 """Decimals of a coordinate: a tenth of a micrometre."""
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class _Native:
-    """A mesh to wrap: its arrays, the file to copy where there is one, its name, what is known of it."""
-
-    vertices: np.ndarray
-    triangles: np.ndarray
-    name: str
-    file: Path | None = None
-    known: Mapping[str, Any] | None = None
 
 
 def run(config: DictConfig, output: Path) -> None:
@@ -63,18 +50,23 @@ def run(config: DictConfig, output: Path) -> None:
     folder = Path(config.out).expanduser() if config.out else output
     pair = write_pair(folder, found, mesh, vertices=native.vertices, triangles=native.triangles,
                       name=native.name, source=native.file)  # fmt: skip
-    report = {
-        "native": native.name, "pair": [pair.native.name, pair.wrap.name],
-        "unit": found.frame.unit, "up": found.frame.up, "forward": found.frame.forward,
-        "symmetric": found.symmetric, "notes": list(found.notes), **quality.as_dict(),
-    }  # fmt: skip
-    text = json.dumps(report, indent=2) + "\n"
-    atomic_write(folder / "report.json", lambda path: _write_text(path, text))
+    write_report(folder, found, quality, native=pair.native.name)
     _say(found, quality, pair, config.fill)
     if config.picture:
         from soma_core.tasks.wrap_picture import draw_wrap
 
         draw_wrap(folder / "wrap.png", found, quality, mesh)
+
+
+def write_report(folder: Path, found: Registration, quality: Quality, *, native: str) -> None:
+    """Write ``report.json``: what was found, and how good the wrap is; `native` is the file of the mesh."""
+    report = {
+        "native": native, "pair": [native, WRAP_FILE],
+        "unit": found.frame.unit, "up": found.frame.up, "forward": found.frame.forward,
+        "symmetric": found.symmetric, "notes": list(found.notes), **quality.as_dict(),
+    }  # fmt: skip
+    text = json.dumps(report, indent=2) + "\n"
+    atomic_write(folder / "report.json", lambda path: _write_text(path, text))
 
 
 def _say(found: Registration, quality: Quality, pair: WrapPair, fill: Sequence[str]) -> None:
@@ -98,7 +90,7 @@ def _say(found: Registration, quality: Quality, pair: WrapPair, fill: Sequence[s
     )  # fmt: skip
 
 
-def _read_native(config: DictConfig) -> _Native:
+def _read_native(config: DictConfig) -> NativeMesh:
     chosen = config.backend is not None
     if chosen == (config.native is not None):
         raise InputError(
@@ -108,16 +100,17 @@ def _read_native(config: DictConfig) -> _Native:
             fix="Pass native=BODY.obj or backend=NAME.",
         )
     if chosen:
-        return _neutral(config.backend)
+        options, params = given_params(config.backend.options), given_params(config.backend.params)
+        return neutral_mesh(default_registry(), config.backend.name, options=options, params=params)
     path = Path(config.native).expanduser()
     if path.suffix.lower() == ".obj":
-        return _Native(vertices=(read := read_obj(path))[0], triangles=read[1], name=path.name, file=path)
+        return NativeMesh(vertices=(read := read_obj(path))[0], triangles=read[1], name=path.name, file=path)
     if path.suffix.lower() != ".ply":
         raise InputError(
             "native", got=f"the suffix {path.suffix!r}", expected=".obj or .ply", fix="Export it as OBJ."
         )
     vertices = read_mesh_vertices(path)
-    return _Native(vertices=vertices, triangles=_ply_triangles(path, vertices), name=f"{path.stem}.obj")
+    return NativeMesh(vertices=vertices, triangles=_ply_triangles(path, vertices), name=f"{path.stem}.obj")
 
 
 def _ply_triangles(path: Path, vertices: np.ndarray) -> np.ndarray:
@@ -129,38 +122,7 @@ def _ply_triangles(path: Path, vertices: np.ndarray) -> np.ndarray:
     return np.asarray(loaded.faces, np.int64)
 
 
-def _neutral(choice: DictConfig) -> _Native:
-    """The mesh that a backend makes of its parameters, with the faces of the native mesh that it declares."""
-    registry, name = default_registry(), choice.name
-    spec = registry.spec(name)
-    if spec.wrap is None:
-        raise InputError(
-            "backend", got=name, expected="a backend with a topology of its own", fix="It needs no wrap."
-        )
-    cpu, dtype = torch.device("cpu"), torch.float64
-    options = given_params(choice.options)
-    generator = registry.generator(name, device=cpu, dtype=dtype, options=options, wrapped=False)
-    params = batch_parameters(spec, given_params(choice.params), device=cpu, dtype=dtype)
-    with registry.isolated(name, "rest"), torch.no_grad():
-        vertices = generator.rest(params)[0].double().numpy()
-    if isinstance(generator, HasTriangles):
-        triangles = generator.triangles().numpy()
-    elif spec.wrap.native.is_file():
-        triangles = read_obj(spec.wrap.native)[1]
-    else:
-        raise InputError(
-            "backend",
-            got=f"{name}, whose generator has no triangles(), and no file {spec.wrap.native}",
-            expected="one of the two, for the faces",
-            fix="Write the neutral mesh as OBJ and pass native=FILE.",
-        )
-    return _Native(
-        vertices=vertices, triangles=triangles, name=f"{name}_neutral.obj",
-        known={"unit": spec.unit, "up": spec.up, "forward": spec.forward},
-    )  # fmt: skip
-
-
-def _options(config: DictConfig, native: _Native) -> WrapOptions:
+def _options(config: DictConfig, native: NativeMesh) -> WrapOptions:
     known = dict(native.known or {})
     for key in ("up", "forward"):
         value = getattr(config, key)

@@ -51,7 +51,7 @@ def soma_backend() -> BackendSpec:
             ),
         ),
         wrap=WrapPair(native=native, wrap=wrap),
-        fill_segments=("mouth_bag", "eye_bags"),
+        fill_segments=("mouth_bag", "eye_bags", "between_toes"),
         files=(
             FileNeeded(path=_model(), description="the converted shape space", url=_URL, command=_CONVERT),
             FileNeeded(path=native, description="its mean body, mean.obj beside point.pca", url=_URL),

@@ -66,7 +66,7 @@ def declare(family: Family) -> BackendSpec:
             ),
         ),
         wrap=WrapPair(native=native, wrap=wrap),
-        fill_segments=("mouth_bag", "eye_bags"),
+        fill_segments=("mouth_bag", "eye_bags", "between_toes"),
         files=(
             FileNeeded(
                 path=model,
