@@ -17,11 +17,14 @@ from worker import Call, Work, serve
 
 from soma_core.layer import SomaLayer
 
+_SAME_WORK = {"procedural": False, "correctives": None}
+"""The peers skin by the 78 public joints: their template with twist joints is not in the package."""
+
 
 def main(backend: str, device: str = "cpu") -> None:
     torch.set_num_threads(2)
     begin = time.perf_counter()
-    layer = SomaLayer(backend, device=device)
+    layer = SomaLayer(backend, device=device, **_SAME_WORK)
     construction = time.perf_counter() - begin
 
     def params(inputs: dict[str, np.ndarray]) -> dict[str, torch.Tensor]:
@@ -67,7 +70,7 @@ def main_inversion(device: str = "cpu") -> None:
     from soma_core.inversion import PoseInversion
 
     torch.set_num_threads(2)
-    layers = {lod: SomaLayer("anny", lod=lod, device=device) for lod in ("mid", "low")}
+    layers = {lod: SomaLayer("anny", lod=lod, device=device, **_SAME_WORK) for lod in ("mid", "low")}
 
     @torch.no_grad()
     def prepare(case: str, inputs: dict[str, np.ndarray]) -> Work:

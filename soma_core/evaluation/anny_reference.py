@@ -52,7 +52,7 @@ def run(config: DictConfig) -> Report:
     """Compare `config.experiment.count` random identities in as many random poses, in float64."""
     count = config.experiment.count
     model = anny_package_model(rig="soma", topology="soma", dtype=torch.float64)
-    layer = SomaLayer("anny", dtype=torch.float64, exact=True)
+    layer = SomaLayer("anny", dtype=torch.float64, exact=True, procedural=False, correctives=None)
     random = np.random.default_rng(config.seed)
     drawn = sample_parameters(layer.spec, count, random, skip_groups={"local_changes"})
     params = {name: torch.as_tensor(drawn[name]) for name in _PHENOTYPES}

@@ -13,7 +13,7 @@ from omegaconf import OmegaConf
 
 from soma_core.config.schema import InversionChoice
 from soma_core.errors import InputError
-from soma_core.evaluation.inversion_sequences import MovingMesh
+from soma_core.evaluation.inversion_sequences import MovingMesh, plain_layer
 from soma_core.inversion import InversionResult, PoseInversion
 from soma_core.inversion.options import inversion_options
 from soma_core.inversion.report import InversionReport
@@ -71,9 +71,18 @@ class MethodRun:
 
 
 def run_methods(
-    meshes: Iterable[MovingMesh], methods: Sequence[str], *, device: str
+    meshes: Iterable[MovingMesh],
+    methods: Sequence[str],
+    *,
+    device: str,
+    plain: bool = True,
+    refreshes: int | None = None,
 ) -> tuple[dict[str, MethodRun], list[MethodRun]]:
     """Fit all meshes by all methods.
+
+    Args:
+        plain: fit with plain skinning, else with the full model.
+        refreshes: in place of the method's own.
 
     Returns:
         Method -> its run over all meshes together; and the default method (or the last one) on each mesh.
@@ -82,11 +91,14 @@ def run_methods(
         InputError: no config ``inversion/<method>`` exists.
     """
     meshes = list(meshes)
-    layers = {name: SomaLayer(name, device=device) for name in {mesh.backend for mesh in meshes}}
+    make = plain_layer if plain else SomaLayer
+    layers = {name: make(name, device=device) for name in {mesh.backend for mesh in meshes}}
     shown = DEFAULT_METHOD if DEFAULT_METHOD in methods else methods[-1]
     together, each = {}, []
     for method in progress(methods, label="method", total=len(methods), after=5.0):
         choice = method_options(method)
+        if refreshes is not None:
+            choice["refreshes"] = refreshes
         runs = [_Run(mesh, layers[mesh.backend], choice) for mesh in meshes]
         together[method] = _gathered(runs, method, "all")
         if method == shown:

@@ -69,27 +69,41 @@ class MovingMesh:
     rotations: Tensor | None = None
 
 
+def plain_layer(name: str, *, device: torch.device | str = "cpu") -> SomaLayer:
+    """A layer that skins by the 78 public joints alone, as the paper's inversion and its peers do."""
+    return SomaLayer(name, procedural=False, correctives=None, device=device)
+
+
+def full_model_meshes(count: int, seed: int) -> Iterator[MovingMesh]:
+    """Meshes that the full model posed, with twist joints and correctives: two bodies in smooth motion."""
+    return _smooth(SomaLayer("anny"), SomaLayer("soma"), count, seed)
+
+
 def own_meshes(count: int, seed: int) -> Iterator[MovingMesh]:
-    """Meshes that our layer posed, so that an exact solution exists: smooth and recorded motions.
+    """Meshes that plain skinning posed, so that an exact solution exists: smooth and recorded motions.
 
     Motions are the project's own clip and those in the folder ``motions`` of SOMA_TEST_DATA, each cut to
     `count` frames spread over it.
     """
-    anny, native = SomaLayer("anny"), SomaLayer("soma")
+    anny, native = plain_layer("anny"), plain_layer("soma")
+    yield from _smooth(anny, native, count, seed)
+    for path in (assets_dir() / "motions/range_of_motion.npz", *_recorded()):
+        motion = read_motion(path)
+        kept = np.unique(np.linspace(0, motion.frame_count - 1, count).astype(int))
+        rotations, hips = torch.as_tensor(motion.rotations[kept]), torch.as_tensor(motion.translation[kept])
+        yield _posed(anny, ANNY_IDENTITIES["man"], rotations, hips, f"anny, {path.stem.replace('_', ' ')}")
+
+
+def _smooth(anny: SomaLayer, native: SomaLayer, count: int, seed: int) -> Iterator[MovingMesh]:
+    """A man of Anny and a random native body, each in a smooth random motion."""
     random = np.random.default_rng([seed, 1])
     shape = {"shape": random.standard_normal(16).tolist()}
-    man = ANNY_IDENTITIES["man"]
-    for layer, params in ((anny, man), (native, shape)):
+    for layer, params in ((anny, ANNY_IDENTITIES["man"]), (native, shape)):
         turns = smooth_axis_angles(joint_spread(layer.joint_names), count, random)
         drift = np.cumsum(_STEP * random.standard_normal((count, 3)), axis=0) + _HIPS
         rotations = axis_angle_to_matrix(torch.as_tensor(turns)).float()
         name = f"{layer.backend}, smooth random motion"
         yield _posed(layer, params, rotations, torch.as_tensor(drift).float(), name)
-    for path in (assets_dir() / "motions/range_of_motion.npz", *_recorded()):
-        motion = read_motion(path)
-        kept = np.unique(np.linspace(0, motion.frame_count - 1, count).astype(int))
-        rotations, hips = torch.as_tensor(motion.rotations[kept]), torch.as_tensor(motion.translation[kept])
-        yield _posed(anny, man, rotations, hips, f"anny, {path.stem.replace('_', ' ')}")
 
 
 def _recorded() -> Sequence[Path]:
