@@ -129,17 +129,20 @@ def search_parameters(
 
     Two models that share a rest shape turn it about other joint centres and bend their skin differently;
     neither is a fault of the shape. Joint centres are therefore unknowns too, to be dropped in the end, and a
-    second descent lets vertices count by how well they are explained.
+    second descent lets vertices count by how well they are explained. A single frame does not tell joints and
+    bending from shape: there the parameters are all that is sought.
     """
     few = _Search(inversion, sample.some(_FEW_FRAMES), parameters)
     found = [few.descend(point, _PLAIN, min(iterations, _FEW_STEPS))[0] for point in _starts(few, parameters)]
     best = min(found, key=lambda state: float(few.sample.mean(state.squares)))
-    unknowns = WithJoints(parameters, inversion.layer)
+    count, moving = len(best.point), len(sample.vertices) > 1
+    unknowns = WithJoints(parameters, inversion.layer) if moving else parameters
     whole = _Search(inversion, sample, unknowns)
-    count = len(best.point)
-    state, _ = whole.descend(np.concatenate((best.point, unknowns.start[count:])), _PLAIN, iterations)
-    state, converged = whole.descend(state.point, _ROBUST, iterations)
-    identity = parameters.identities(state.point[None, :count])
+    point = np.concatenate((best.point, unknowns.start[count:]))
+    for scale in (_PLAIN, _ROBUST) if moving else (_PLAIN,):
+        state, converged = whole.descend(point, scale, iterations)
+        point = state.point
+    identity = parameters.identities(point[None, :count])
     return ShapeFound(identity=identity, history=tuple(whole.history), converged=converged)
 
 

@@ -16,6 +16,8 @@ from tests.plugin.fakes import FakeEntryPoint
 FRAMES = 5
 NOTHING_M = 5e-5
 """The descent ends where a step no longer changes the error noticeably."""
+SAME = 1e-3
+"""Relative: the same fit begun from elsewhere."""
 NEAR = 0.05
 """Of a coefficient: bulges of three centimetres on a tenth of the skin still count a little."""
 
@@ -73,3 +75,14 @@ def test_what_no_body_explains_counts_less(inversion):
     vertices = frames.vertices + 0.03 * bulging[:, None]
     found = search(inversion, Sample(vertices=vertices, weights=frames.weights), ["shape"])
     np.testing.assert_allclose(found.identity.params["shape"][0], shape, atol=NEAR)
+
+
+def test_a_single_frame_ends_at_the_least_error_of_the_parameters(inversion):
+    """No joint centre is free that would be dropped in the end, and every vertex counts alike."""
+    frames = sample(inversion, {"shape": [0.9, -0.5, 0.4, 0.7]})
+    frame = Sample(vertices=frames.vertices[:1] + 0.01 * randn(1, 1, 3, seed=4), weights=frames.weights)
+    frame.vertices[:, ::10] += 0.03
+    found = search(inversion, frame, ["shape"])
+    assert list(found.history) == sorted(found.history, reverse=True)
+    pose = inversion(frame.vertices, found.identity, weights=frame.weights)
+    assert frame.error(pose) == pytest.approx(found.history[-1], rel=SAME)
