@@ -178,3 +178,17 @@ def test_a_motion_is_found_from_the_current_folder(motion, tmp_path, monkeypatch
 def test_null_parameters_take_their_default():
     values = OmegaConf.create({"age": None, "weight": 0.3, "shape": [1, 2]})
     assert task.given_params(values) == {"weight": 0.3, "shape": [1, 2]}
+
+
+def test_the_extra_low_mesh_is_written_with_its_own_faces_and_texture(tmp_path):
+    pytest.importorskip("pxr", reason="usd-core is not installed")
+    from pxr import Usd, UsdGeom
+
+    task.run(configured(lod="xlo", write=["npz", "usd", "glb"]), tmp_path)
+    assert (tmp_path / "body.glb").stat().st_size > 0
+    stage = Usd.Stage.Open(str(tmp_path / "body.usdc"))
+    mesh = UsdGeom.Mesh(stage.GetDefaultPrim().GetChild("Mesh"))
+    assert len(mesh.GetPointsAttr().Get()) == 612
+    assert list(mesh.GetFaceVertexCountsAttr().Get()) == 1220 * [3]
+    assert len(UsdGeom.PrimvarsAPI(mesh).GetPrimvar("st").ComputeFlattened()) == 3660
+    assert read_motion(tmp_path / "motion.npz").rig_revision.endswith("-xlo")
