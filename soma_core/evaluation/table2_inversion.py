@@ -53,8 +53,8 @@ def run(config: DictConfig) -> Report:
         figures=[*_figures(own.get(DEFAULT_METHOD), native.get(DEFAULT_METHOD)), _gain(full)],
         notes=(
             "Plain skinning by the 78 public joints, but where the full model is named. Errors are distances "
-            "of vertices outside the mouth and eye bags. The angles are those of joints that move at least 50 "
-            "vertices. Frames per second are those of this run, in passing; `benchmarks/run.py` times.",
+            "of vertices outside the mouth and eye bags. The angles are those of joints that move at least "
+            "50 vertices. Frames per second are those of this run, in passing; `benchmarks/run.py` times.",
         ),
     )
 
