@@ -116,7 +116,7 @@ def run(config: DictConfig) -> Report:
         notes=(
             "Errors against the transferred vertices, mouth and eye bags left out. The body is unposed from "
             "the frames of the person themselves: few frames leave it free to take up what skinning does not "
-            f"explain. Before unposing it is one of {config.experiment.backend}'s own shapes. In the picture, "
+            f"explain. Before unposing it is one of the shapes of {config.experiment.backend}. In the picture, "
             "blue is the target.",
         ),
     )
