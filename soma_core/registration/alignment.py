@@ -19,6 +19,9 @@ __all__ = ["Start", "find_starts"]
 _ARMS = (0.0, 0.5, 1.0, 1.4)
 """Poses that are tried, on the way from the T-pose (0) to the bind pose (1)."""
 
+_ROUGHLY, _LEFT = 200, 12
+"""Samples in a first look at all starts, and how many of these are looked at well."""
+
 _SAMPLES = 1200
 _SOFT = 0.08
 """Distance [m] at which a sample counts half."""
@@ -47,32 +50,35 @@ def find_starts(
     unit = unit or find_unit(float(extent.max()))
     centre = cast("tuple[float, float, float]", tuple((skin.vertices.max(0) + skin.vertices.min(0)) / 2))
     bodies = [(pose := model.start(share), _mean_body(model, pose)) for share in _ARMS]
-    starts = []
-    for high, ahead in product([up] if up else _AXES, [forward] if forward else _AXES):
-        if high[1] == ahead[1]:
-            continue
-        frame = Frame(unit=unit, up=high, forward=ahead, centre=centre)
-        surface = skin.surface(frame)
-        starts += [_start(surface, frame, model, *body) for body in bodies]
-    if not starts:
+    axes = product([up] if up else _AXES, [forward] if forward else _AXES)
+    frames = [
+        Frame(unit=unit, up=high, forward=ahead, centre=centre) for high, ahead in axes if high[1] != ahead[1]
+    ]
+    if not frames:
         raise InputError(
             "forward", got=repr(forward), expected=f"an axis across up={up!r}", fix="Correct one of the two."
         )
-    return sorted(starts, key=lambda start: start.cost)[:count]
+    surfaces = [skin.surface(frame) for frame in frames]
+    tried = [(*each, *body) for each in zip(surfaces, frames, strict=True) for body in bodies]
+    costs = [_start(*each, model, _ROUGHLY).cost for each in tried]
+    best = [tried[index] for index in np.argsort(costs, kind="stable")[: max(_LEFT, count)]]
+    return sorted((_start(*each, model, _SAMPLES) for each in best), key=lambda start: start.cost)[:count]
 
 
 def _mean_body(model: BodyModel, pose: BodyPose) -> Surface:
     return Surface(model.evaluate(pose)[0], model.triangles)
 
 
-def _start(surface: Surface, frame: Frame, model: BodyModel, pose: BodyPose, body: Surface) -> Start:
+def _start(
+    surface: Surface, frame: Frame, pose: BodyPose, body: Surface, model: BodyModel, samples: int
+) -> Start:
     """Place the mean body by its box, scaled to the mesh's height, and measure both ways."""
     size = np.ptp(surface.vertices[:, 1]) / np.ptp(body.vertices[:, 1])
     middle = (body.vertices.max(0) + body.vertices.min(0)) / 2
-    ids = model.skin[:: max(1, len(model.skin) // _SAMPLES)]
+    ids = model.skin[:: max(1, len(model.skin) // samples)]
     placed = size * (body.vertices[ids] - middle)
     gap = surface.facing(placed, body.normals[ids]).points - placed
-    chosen = np.arange(0, len(surface.vertices), max(1, len(surface.vertices) // _SAMPLES))
+    chosen = np.arange(0, len(surface.vertices), max(1, len(surface.vertices) // samples))
     seen = surface.vertices[chosen] / size + middle
     back = size * (body.facing(seen, surface.normals[chosen]).points - seen)
     squared = [(offset**2).sum(1) for offset in (gap, back)]

@@ -7,6 +7,7 @@ and the scale shrinks.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 
@@ -30,6 +31,9 @@ _FACING = 0.3
 
 _TANGENT = 0.1
 """Weight of the distance along the surface: little, so that parts slide into place."""
+
+_ACROSS = math.sqrt(1 + _TANGENT**2) - _TANGENT
+"""What the distance across it weighs more: the root of ``n n^T + t^2`` is ``t + _ACROSS n n^T``."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -165,30 +169,35 @@ def _step(
     matrix, right = np.zeros((size, size)), np.zeros(size)
     lever = vertices[:, None] - joints[None, model.joints]
     for pull in pulls:
+        rows = _jacobian(model, pull, lever, derivative)
         offset = pull.targets - pull.points
-        moved = np.einsum("mk,mkj->mj", pull.shares, model.moved[pull.vertices][..., model.joints])
-        arms = np.einsum("mk,mkjc->mjc", pull.shares, lever[pull.vertices])
-        for directions, weight in _directions(pull.normals):
-            rows = np.zeros((len(offset), size))
-            turned = moved[..., None] * np.cross(arms, directions[:, None])
-            rows[:, : 3 * count] = turned.reshape(len(offset), -1)
-            rows[:, 3 * count : 3 * count + 3] = directions
-            if derivative is not None:
-                along = np.einsum("kmac,ma,mc->mk", derivative[:, pull.vertices], pull.shares, directions)
-                rows[:, 3 * count + 3 :] = along
-            weighed = rows * (weight * pull.weights)[:, None]
-            matrix += weighed.T @ rows
-            right += weighed.T @ (offset * directions).sum(1)
+        normals = pull.normals.astype(np.float32)
+        along = (normals[:, None] @ rows).squeeze(1)
+        rows = _TANGENT * rows + _ACROSS * normals[..., None] * along[:, None]
+        wanted = _TANGENT * offset + _ACROSS * pull.normals * (pull.normals * offset).sum(1, keepdims=True)
+        share = np.sqrt(pull.weights)[:, None]
+        flat = (share[..., None].astype(np.float32) * rows).reshape(-1, size)
+        matrix += flat.T @ flat
+        right += flat.T @ (share * wanted).ravel().astype(np.float32)
     _add_priors(model, pose, start, matrix, right, free, ends)
     solved = scipy.linalg.cho_solve(scipy.linalg.cho_factor(matrix), right)
     return solved if free else np.concatenate([solved, np.zeros(model.count)])
 
 
-def _directions(normals: np.ndarray) -> Iterator[tuple[np.ndarray, float]]:
-    """The normal, and with little weight the three axes."""
-    yield normals, 1.0
-    for axis in np.eye(3):
-        yield np.broadcast_to(axis, normals.shape), _TANGENT**2
+def _jacobian(model: BodyModel, pull: _Pull, lever: np.ndarray, derivative: np.ndarray | None) -> np.ndarray:
+    """Motion (m, 3, n) float32 of the points of a pull by turns of the joints, the hips, and the shape."""
+    count, joints = len(pull.points), len(model.joints)
+    free = 0 if derivative is None else derivative.shape[2]
+    motion = np.zeros((count, 3, 3 * joints + 3 + free), np.float32)
+    moved = np.einsum("mk,mkj->mj", pull.shares, model.moved[pull.vertices][..., model.joints])
+    arms = moved[..., None] * np.einsum("mk,mkjc->mjc", pull.shares, lever[pull.vertices])
+    for axis, (after, last) in enumerate(((1, 2), (2, 0), (0, 1))):
+        motion[:, after, axis : 3 * joints : 3] = -arms[..., last]
+        motion[:, last, axis : 3 * joints : 3] = arms[..., after]
+        motion[:, axis, 3 * joints + axis] = 1
+    if derivative is not None:
+        motion[:, :, -free:] = np.einsum("ma,mack->mck", pull.shares, derivative[pull.vertices])
+    return motion
 
 
 def _add_priors(

@@ -123,10 +123,10 @@ class BodyModel:
 
     @torch.no_grad()
     def shape_derivative(self, pose: BodyPose) -> np.ndarray:
-        """Change of the vertices by each component, (k, v, 3), in this pose; nearly constant in the shape."""
+        """Change of the vertices by each component, (v, 3, k), in this pose; nearly constant in the shape."""
         around = np.concatenate([pose.shape[None], pose.shape[None] + np.eye(self.count)])
         vertices = self.layer(*self._tensors(around, pose)).vertices.double().numpy()
-        return vertices[1:] - vertices[:1]
+        return np.ascontiguousarray((vertices[1:] - vertices[:1]).transpose(1, 2, 0))
 
     def _tensors(self, shapes: np.ndarray, pose: BodyPose) -> tuple:
         dtype = self.layer.dtype

@@ -27,6 +27,9 @@ class ClosestFaces:
         order = np.argsort(corners, kind="stable")
         self._face_of_corner = order // 3
         self._start = np.searchsorted(corners[order], np.arange(len(vertices) + 1))
+        points = vertices[triangles]
+        self._centres = points.mean(1)
+        self._radii = np.linalg.norm(points - self._centres[:, None], axis=2).max(1)
 
     def query(self, points: np.ndarray) -> np.ndarray:
         """Id of the closest face of each point; (m, 3) -> (m,) int64."""
@@ -41,17 +44,23 @@ class ClosestFaces:
         """Closest face of each point among those that touch the face proposed for it; (m,) int64."""
         centre = self._vertices.mean(0)
         scale = float(np.abs(self._vertices - centre).max()) or 1.0
-        query, face = self._touching(proposed)
-        closest = closest_point_on_triangle(points[query], self._vertices[self._triangles[face]])
-        offset = points[query] - closest
-        squared = np.einsum("nc,nc->n", offset, offset)
-        nearest = np.full(len(points), np.inf)
-        np.minimum.at(nearest, query, squared)
         slack = 1e-12 * scale * scale
+        nearest = self._squared(points, proposed)
+        query, face = self._touching(proposed)
+        away = np.linalg.norm(points[query] - self._centres[face], axis=1) - self._radii[face]
+        near = away <= np.sqrt(nearest + slack)[query] + 1e-9 * scale  # the others cannot be nearer
+        query, face = query[near], face[near]
+        squared = self._squared(points[query], face)
+        np.minimum.at(nearest, query, squared)
         tied = squared <= nearest[query] + slack
         best = np.full(len(points), np.iinfo(np.int64).max)
         np.minimum.at(best, query[tied], face[tied])
         return best
+
+    def _squared(self, points: np.ndarray, faces: np.ndarray) -> np.ndarray:
+        """Squared distance of each point to the face given for it; (m,)."""
+        offset = points - closest_point_on_triangle(points, self._vertices[self._triangles[faces]])
+        return np.einsum("nc,nc->n", offset, offset)
 
     def _touching(self, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Pairs (query, face): every face that shares a corner with the query's proposed face."""
