@@ -62,6 +62,10 @@ TASKS = {
     "train-shape": TaskRow(
         module="train_shape", summary="learn the native shape space from installed backends"
     ),
+    "train-correctives": TaskRow(
+        module="train_correctives",
+        summary="learn pose correctives from a teacher: elastic skin, or a backend",
+    ),
     "evaluate": TaskRow(module="evaluate", summary="measure a claim of the paper, in millimetres"),
     "bench": TaskRow(module="bench", summary="time the forward path, correctness first"),
 }

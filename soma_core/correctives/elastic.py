@@ -10,6 +10,7 @@ import torch
 from scipy.sparse.linalg import splu
 from torch import Tensor
 
+from soma_core.cache import content_key
 from soma_core.correctives.bind_body import BindBody
 from soma_core.correctives.frames import SurfaceFrames, diffused, random_walk
 from soma_core.correctives.masks import find_creases, geodesic_falloff, mesh_edges
@@ -30,6 +31,8 @@ _HELD_FROM = 0.7
 
 _REACH = 1.5
 """How far a section around a joint goes along the surface, in thicknesses of the limb."""
+
+_VERSION = 1  # raise when the surface comes out differently
 
 _VOLUME_STEPS = 6
 _CHUNK = 4
@@ -79,6 +82,8 @@ class ElasticSurface:
         falloff = geodesic_falloff(mesh, creases, reach=_REACH)
         self.sections = Sections(points, mesh.triangles, falloff, np.array(creases.joints), rig.bind_world)
         self._response = self._volume_response(points)
+        weights = self.body.weights
+        self.key = content_key(_VERSION, points, weights.data, weights.indices, weights.indptr, edges)
 
     def __call__(self, relative: Tensor) -> Tensor:
         """Posed vertices (B, v, 3) [m], Hips where they are in the bind pose.

@@ -26,6 +26,9 @@ class PoseFeatures(torch.nn.Module):
     (Zhou et al., On the Continuity of Rotation Representations in Neural Networks, 2019).
     """
 
+    left: Tensor
+    right: Tensor
+
     def __init__(self, rig: Rig, *, dtype: torch.dtype, device: torch.device | str) -> None:
         super().__init__()
         orient = rig.t_pose_world[:, :3, :3]

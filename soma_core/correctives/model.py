@@ -74,11 +74,13 @@ class Correctives(torch.nn.Module):
             relative: T-pose-relative rotations (B, J - 1, 3, 3).
             bind_world: bind transforms of the identities (B or 1, J, 4, 4): offsets grow with the body.
         """
-        batch = len(relative)
-        seen = self.features(relative).flatten(1).T.contiguous()
-        active = torch.relu(self.first(seen))
+        return self.offsets(self.features(relative)) * self.scale(bind_world)[:, None, None]
+
+    def offsets(self, features: Tensor) -> Tensor:
+        """Offsets (B, v, 3) [m] of the canonical body from features (B, J, 6)."""
+        active = torch.relu(self.first(features.flatten(1).T.contiguous()))
         moved = self.second(torch.tanh(active) if self.use_tanh else active)
-        return moved.view(-1, 3, batch).permute(2, 0, 1) * self.scale(bind_world)[:, None, None]
+        return moved.view(-1, 3, len(features)).permute(2, 0, 1)
 
 
 def find_correctives(given: Path | str | None, *, shipped: bool) -> Path | None:

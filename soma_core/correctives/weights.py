@@ -135,7 +135,7 @@ def _assembled(content: Mapping[str, Any], metres: float) -> CorrectiveWeights:
     joints = len(bind)
     joint_mask, vertex_mask = (_matrix(content[key], key) for key in ("M1_mask", "M2_mask"))
     first, second = _matrix(content["W1"], "W1"), _matrix(content["W2"], "W2")
-    expected = {
+    expected: dict[str, tuple[tuple[int, ...], list[tuple[int, ...]]]] = {
         "bindpose": (bind.shape, [(joints, 3, 3), (joints, 4, 4)]),
         "M1_mask": (joint_mask.shape, [(joints, joints)]),
         "M2_mask": (vertex_mask.shape, [(joints, second.shape[1] // 3)]),

@@ -1,0 +1,234 @@
+"""``soma train-correctives``: learn pose correctives from a teacher."""
+
+from __future__ import annotations
+
+import json
+import logging
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from omegaconf import DictConfig, OmegaConf
+
+from soma_core import __version__
+from soma_core.cache import atomic_write, content_key
+from soma_core.correctives.data import ClipPlan, LessonStore, Split, plan_clips, split_clips
+from soma_core.correctives.finish import Masks, entry_budget, finished
+from soma_core.correctives.masks import find_creases, joint_mask, vertex_mask
+from soma_core.correctives.model import Correctives
+from soma_core.correctives.network import CorrectivesNetwork
+from soma_core.correctives.plot import plot_history
+from soma_core.correctives.processes import Processes, joined_processes
+from soma_core.correctives.teacher import Clip, ElasticTeacher, Teacher
+from soma_core.correctives.training import Trainer, TrainingOptions, reduction
+from soma_core.correctives.weights import CHECKPOINT_NAME, CorrectiveWeights, read_weights, write_weights
+from soma_core.errors import InputError
+from soma_core.io import read_motion
+from soma_core.paths import cache_dir
+from soma_core.progress import progress
+from soma_core.rig import load_canonical
+from soma_core.rig.mesh import CanonicalMesh
+from soma_core.rig.skeleton import Rig
+from soma_core.topology.lod_transfer import offset_rows
+
+__all__ = ["make_teacher", "read_motions", "run"]
+
+_log = logging.getLogger(__name__)
+
+_CODE_VERSION = 1
+_OPTIONS = ("batch", "epochs", "rate", "sparsity", "patience", "ridge", "seed")
+
+
+def run(config: DictConfig, output: Path) -> None:
+    """Teach, train, solve the second stage on all vertices, prune, test on held-out clips, and write.
+
+    Writes ``correctives_model.pt`` (or the file `config.out`), ``report.json`` and, where matplotlib is
+    installed, ``loss.png`` into `output`. Under ``torchrun`` all processes share the work and the first
+    one writes.
+
+    Raises:
+        InputError: data, an option or a teacher that cannot be used.
+        BackendError: the teacher's backend is not usable.
+    """
+    mesh, rig = load_canonical("mid")
+    options = TrainingOptions(mirror=config.data.mirror, **{name: config[name] for name in _OPTIONS})
+    masks = _masks(mesh, rig, config.reach)
+    budget = entry_budget(config.mebibytes, masks, config.channels)
+    clips = _clips(config, rig)
+    with joined_processes(config.device) as processes:
+        teacher = make_teacher(config.teacher, mesh, rig)
+        store = LessonStore(cache_dir() / "train_correctives" / "lessons", teacher, mesh, rig)
+        _teach(store, [clip for part in clips.values() for clip in part], processes)
+        trainer, network = _trained(config, options, masks, store, clips, processes)
+        if processes.rank > 0:
+            return
+        meta = _provenance(config, teacher, clips, mesh)
+        weights = finished(
+            network, masks, store, clips["train"], rig, ridge=options.ridge, budget=budget,
+            mirror=options.mirror, meta={**meta, "epochs": len(trainer.history)},
+        )  # fmt: skip
+        path = Path(config.out) if config.out else output / CHECKPOINT_NAME
+        write_weights(path, weights)
+        measured = _tested(read_weights(path), store, clips["test"], mesh, rig)
+        _report(output, {**meta, **measured, "bytes": path.stat().st_size, "history": trainer.history})
+        _log.info("error to the teacher on held-out clips reduced by %.1f %%", 100 * measured["reduction"])
+        if not plot_history(trainer.history, output / "loss.png"):
+            _log.info("matplotlib is not installed: report.json has the numbers, there is no plot")
+
+
+def make_teacher(name: str, mesh: CanonicalMesh, rig: Rig) -> Teacher:
+    """The elastic surface, or the backend `name` and its own posed meshes.
+
+    Raises:
+        InputError: a backend that cannot show posed meshes.
+        BackendError: no such backend, or not usable.
+    """
+    if name == "elastic":
+        return ElasticTeacher(mesh, rig)
+    from soma_core.tasks.posed_teacher import PosedTeacher
+
+    return PosedTeacher(name)
+
+
+def read_motions(paths: Sequence[str], step: int) -> dict[str, np.ndarray]:
+    """Every `step`-th frame of motion files, or of all motion files in folders; file -> rotations.
+
+    Raises:
+        InputError: a step below one, or absolute rotations.
+        AssetError: a file that cannot be read.
+    """
+    if step < 1:
+        raise InputError("data.step", got=step, expected="at least 1", fix="Take every frame with step=1.")
+    files = [
+        file
+        for path in map(Path, paths)
+        for file in (sorted(path.glob("*.npz")) if path.is_dir() else [path])
+    ]
+    found = {}
+    for file in files:
+        motion = read_motion(file)
+        if motion.convention != "t_pose_relative":
+            raise InputError(
+                "data.motions",
+                got=f"{file} with the convention {motion.convention}",
+                expected="rotations relative to the T-pose",
+                fix="Convert it with `soma convert`.",
+            )
+        found[file.name] = motion.rotations[::step]
+    return found
+
+
+def _masks(mesh: CanonicalMesh, rig: Rig, reach: float) -> Masks:
+    if not 0 < reach <= 10:
+        raise InputError("reach", got=reach, expected="above 0 and at most 10", fix="Try reach=1.5.")
+    creases = find_creases(rig)
+    return Masks(joints=joint_mask(rig, creases), vertices=vertex_mask(mesh, rig, creases, reach=reach))
+
+
+def _clips(config: DictConfig, rig: Rig) -> Mapping[Split, Sequence[Clip]]:
+    data = config.data
+    if not 0 < data.held_out < 0.5:
+        raise InputError(
+            "data.held_out", got=data.held_out, expected="above 0 and below 0.5", fix="Try data.held_out=0.1."
+        )
+    plan = ClipPlan(
+        random_clips=data.random_clips,
+        poses=data.poses,
+        motions=read_motions(data.motions, data.step),
+        seed=config.seed,
+    )
+    clips = plan_clips(plan, rig.user_joint_names)
+    return split_clips(clips, held_out=data.held_out, seed=config.seed)
+
+
+def _teach(store: LessonStore, clips: Sequence[Clip], processes: Processes) -> None:
+    """Fill the cache; every process takes its share of what is missing."""
+    missing = store.missing(clips)
+    processes.wait()  # all have looked before one begins to write
+    own = missing[processes.rank :: processes.count]
+    for clip in progress(own, label="teaching, clip", total=len(own)):
+        store.teach(clip)
+    processes.wait()
+
+
+def _trained(
+    config: DictConfig,
+    options: TrainingOptions,
+    masks: Masks,
+    store: LessonStore,
+    clips: Mapping[Split, Sequence[Clip]],
+    processes: Processes,
+) -> tuple[Trainer, CorrectivesNetwork]:
+    """Train both stages on the vertices of ``config.lod``."""
+    vertices = _training_vertices(config)
+    network = CorrectivesNetwork(
+        masks.joints, masks.vertices[:, vertices].tocsr(), channels=config.channels, seed=config.seed
+    ).to(config.device)
+    trainer = Trainer(
+        network, store, train=clips["train"], validation=clips["validation"], vertices=vertices,
+        options=options, processes=processes,
+    )  # fmt: skip
+    named = [[clip.name for clip in clips[part]] for part in clips]
+    shape = (config.channels, config.reach, str(config.lod), processes.count, config.device)
+    key = content_key(_CODE_VERSION, str(options), str(shape), json.dumps(named), store.key)
+    trainer.run(
+        state=cache_dir() / "train_correctives" / f"{key}.pt",
+        key=key,
+        resume=config.resume,
+        progress=lambda steps, done: progress(steps, label="epoch", total=options.epochs, done=done),
+    )
+    return trainer, network
+
+
+def _training_vertices(config: DictConfig) -> np.ndarray:
+    """Ids in the mid LOD of the vertices that the first stage is trained on."""
+    mesh, _ = load_canonical("mid" if str(config.lod) == "mid" else "low")
+    return mesh.mid_ids
+
+
+def _tested(
+    weights: CorrectiveWeights, store: LessonStore, clips: Sequence[Clip], mesh: CanonicalMesh, rig: Rig
+) -> dict[str, float]:
+    """How well the written file does on clips that had no part in training."""
+    model = Correctives(weights, rig, offset_rows(mesh), dtype=torch.float32, device="cpu")
+    lessons = (store.read(clip, np.arange(mesh.vertex_count)) for clip in clips)
+    with torch.no_grad():
+        share, left = reduction((model.offsets(lesson.features), lesson.offsets) for lesson in lessons)
+    return {"reduction": round(share, 5), "rms_mm": round(left, 5)}
+
+
+def _provenance(
+    config: DictConfig, teacher: Teacher, clips: Mapping[Split, Sequence[Clip]], mesh: CanonicalMesh
+) -> dict[str, Any]:
+    settings = {name: config[name] for name in (*_OPTIONS, "channels", "reach", "mebibytes")}
+    return {
+        **teacher.provenance,
+        "rig_revision": mesh.revision,
+        "version": __version__,
+        "commit": _commit(),
+        "data": OmegaConf.to_container(config.data, resolve=True),
+        "clips": {part: len(found) for part, found in clips.items()},
+        "poses": {part: sum(len(clip.rotations) for clip in found) for part, found in clips.items()},
+        "settings": {**settings, "lod": str(config.lod)},
+    }
+
+
+def _commit() -> str:
+    """Commit of a source checkout; empty for an installed package."""
+    git = Path(__file__).resolve().parents[2] / ".git"
+    try:
+        head = (git / "HEAD").read_text(encoding="utf-8").strip()
+        return (git / head.removeprefix("ref: ")).read_text(encoding="utf-8").strip()
+    except OSError:
+        return ""
+
+
+def _write_text(path: Path, text: str) -> None:
+    path.write_text(text, encoding="utf-8")
+
+
+def _report(output: Path, content: Mapping[str, Any]) -> None:
+    text = json.dumps(content, indent=2) + "\n"
+    atomic_write(output / "report.json", lambda path: _write_text(path, text))
