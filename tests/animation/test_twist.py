@@ -1,7 +1,6 @@
 """Twist joints on the shipped rig: against a loop over helpers, and what they must preserve."""
 
 import functools
-import itertools
 from dataclasses import replace
 
 import numpy as np
@@ -311,48 +310,3 @@ def test_gradcheck_of_the_angles(rig, angle):
 
     vector = (along_bone + 0.02).requires_grad_()
     assert torch.autograd.gradcheck(channels, (vector, bind.requires_grad_()), fast_mode=True)
-
-
-# --- what it is for -------------------------------------------------------------------------------------
-
-
-def section_areas(vertices, triangles, planes):
-    """Areas [m2] of the sections of a closed mesh with planes x = const."""
-    areas = []
-    for plane in planes:
-        side = vertices[:, 0][triangles] > plane
-        cut = side.any(1) & ~side.all(1)
-        total = 0.0
-        for corners, above in zip(vertices[triangles[cut]], side[cut], strict=True):
-            ends = []
-            for a, b in itertools.pairwise((0, 1, 2, 0)):
-                if above[a] != above[b]:
-                    share = (plane - corners[a, 0]) / (corners[b, 0] - corners[a, 0])
-                    ends.append((corners[a] + share * (corners[b] - corners[a]), above[a]))
-            (first, leaves), (second, _) = ends
-            turn = first[1] * second[2] - first[2] * second[1]
-            total += 0.5 * (turn if leaves else -turn)
-        areas.append(abs(total))
-    return np.array(areas)
-
-
-def test_the_wrist_of_a_forearm_twisted_by_150_degrees_keeps_its_volume():
-    """The wrist, 3 cm either way: at most a third of the loss of plain skinning is left."""
-    layer = body()
-    identity = layer.identity({})
-    rotations = torch.zeros(1, 77, 3, dtype=torch.float64)
-    rotations[0, layer.joint_names.index("LeftHand"), 0] = np.radians(150)  # the arm lies along x
-    poses = {
-        "rest": layer.pose_plain(identity, torch.zeros_like(rotations)),
-        "plain": layer.pose_plain(identity, rotations),
-        "twist": layer.pose(identity, rotations),
-    }
-    wrist = float(poses["rest"].joints[0, layer.joint_names.index("LeftHand"), 0])
-    planes = wrist + np.linspace(-0.03, 0.03, 13)
-    volume = {
-        name: section_areas(pose.vertices[0].numpy(), layer.mesh.triangles, planes).sum()
-        for name, pose in poses.items()
-    }
-    lost = {name: volume["rest"] - volume[name] for name in ("plain", "twist")}
-    assert lost["plain"] > 0.2 * volume["rest"]
-    assert lost["twist"] < lost["plain"] / 3
