@@ -83,6 +83,7 @@ def _contents(root: Path) -> list[str]:
     for check in (
         lambda: load_canonical("mid", root),
         lambda: load_canonical("low", root),
+        lambda: load_canonical("xlo", root),
         lambda: load_shape_space(root / NEUTRAL_NAME),
     ):
         try:
