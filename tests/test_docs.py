@@ -85,6 +85,7 @@ def test_the_table_of_motion_keys_is_complete(tmp_path):
             "params": {"shape": [1.0]},
             "options": {"a": 1},
             "rest": np.zeros((4, 3)),
+            "scale_params": np.zeros((1, 68)),
         },
     )
     write_motion(motion, tmp_path / "m.npz", joint_orient=np.tile(np.eye(3), (77, 1, 1)))

@@ -181,19 +181,18 @@ def _identity(identity: Mapping[str, object]) -> dict[str, object]:
         )
     plain = {name: np.asarray(value, np.float64).tolist() for name, value in params.items()}
     row = np.concatenate([np.empty(0), *(np.ravel(value) for value in plain.values())])[None]
-    coefficients = identity.get("identity_coeffs", row)
-    rest = {"identity_rest": np.asarray(identity["rest"], np.float32)} if "rest" in identity else {}
-    options = identity.get("options")
-    chosen = {"identity_options": json.dumps(options, sort_keys=True)} if options else {}
-    return (
-        rest
-        | chosen
-        | {
-            "identity_model_type": str(identity.get("backend", "")),
-            "identity_params": json.dumps(plain, sort_keys=True),
-            "identity_coeffs": np.asarray(coefficients, np.float32),
-        }
-    )
+    found: dict[str, object] = {
+        "identity_model_type": str(identity.get("backend", "")),
+        "identity_coeffs": np.asarray(identity.get("identity_coeffs", row), np.float32),
+    }
+    if "params" in identity:  # files of the SOMA tools name no parameters
+        found["identity_params"] = json.dumps(plain, sort_keys=True)
+    if identity.get("options"):
+        found["identity_options"] = json.dumps(identity["options"], sort_keys=True)
+    for name, key in (("rest", "identity_rest"), ("scale_params", "scale_params")):
+        if name in identity:
+            found[key] = np.asarray(identity[name], np.float32)
+    return found
 
 
 def check_rig(motion: Motion, revision: str) -> bool:

@@ -63,6 +63,7 @@ def test_a_file_of_soma_tools_comes_to_metres(tmp_path):
     np.savez(
         tmp_path / "m.npz", poses=turns, transl=np.full((3, 3), 150.0), unit="centimeters",
         joint_names=np.array(USER_JOINTS), absolute_pose=False, joint_orient=np.tile(np.eye(3), (77, 1, 1)),
+        identity_model_type="mhr", identity_coeffs=np.ones((1, 45)), scale_params=np.ones((1, 68)),
     )  # fmt: skip
     with pytest.raises(InputError, match=r"fps: got no frame rate.*Pass fps=30"):
         converted(tmp_path / "m.npz", tmp_path / "out")
@@ -71,6 +72,8 @@ def test_a_file_of_soma_tools_comes_to_metres(tmp_path):
     np.testing.assert_array_equal(again.rotations, turns)
     np.testing.assert_allclose(again.translation, 1.5)
     assert again.fps == 50
+    assert sorted(again.identity) == ["backend", "identity_coeffs", "scale_params"]  # and no default body
+    np.testing.assert_array_equal(again.identity["scale_params"], np.ones((1, 68)))
     converted(tmp_path / "m.npz", tmp_path / "mm", fps=50, unit="mm")
     np.testing.assert_allclose(read_motion(tmp_path / "mm/motion.npz").translation, 0.15)
 
