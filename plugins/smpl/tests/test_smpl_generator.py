@@ -75,6 +75,29 @@ def test_posed_agrees_with_the_reference(generator):
         np.testing.assert_allclose(posed[row], expected, atol=ROUNDING, rtol=0)
 
 
+def test_its_skinning_is_the_whole_of_posed(generator):
+    pose, params = random_pose(generator), betas()
+    model = generator.skinning(params)
+    rotations = torch.as_tensor(Rotation.from_rotvec(pose["rotations"].reshape(-1, 3).numpy()).as_matrix())
+    rotations = rotations.unflatten(0, (2, -1))
+    shaped = model.rest + model.pose_offsets(rotations)
+    turns, places = [rotations[:, 0]], [model.joints[:, 0]]
+    for joint, parent in enumerate(model.parents[1:], start=1):
+        step = model.joints[:, joint] - model.joints[:, parent]
+        places.append(places[parent] + (turns[parent] @ step[..., None]).squeeze(-1))
+        turns.append(turns[parent] @ rotations[:, joint])
+    posed = pose["translation"][:, None]
+    for joint, (turn, place) in enumerate(zip(turns, places, strict=True)):
+        moved = (shaped - model.joints[:, joint, None]) @ turn.transpose(-1, -2) + place[:, None]
+        posed = posed + model.weights[:, joint, None] * moved
+    torch.testing.assert_close(posed, generator.posed(params, pose), atol=ROUNDING, rtol=0)
+    assert model.joint_names == generator.family.joint_names
+
+
+def test_its_triangles_are_those_of_the_file(generator):
+    np.testing.assert_array_equal(generator.triangles().numpy(), generator._model.faces)
+
+
 def test_zero_pose_is_the_rest_mesh(generator):
     still = {"rotations": torch.zeros(1, generator.family.joint_count, 3, dtype=torch.float64)}
     torch.testing.assert_close(
