@@ -237,7 +237,7 @@ class TrainCorrectivesConfig:
     reach: float = 1.5
     lod: FitLod = FitLod.low
     batch: int = 64
-    epochs: int = 60
+    epochs: int = 24
     rate: float = 0.003
     sparsity: float = 0.01
     patience: int = 8
@@ -258,6 +258,8 @@ class Experiment:
     count: int = 100
     methods: list[str] = field(default_factory=list)
     data: str | None = None
+    checkpoint: str | None = None
+    motions: list[str] = field(default_factory=list)
 
 
 @dataclass

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -17,24 +16,24 @@ _DAMPING = 0.05
 
 
 class BindBody:
-    """Skinning of one body that is bound in the rig's bind pose, with twist joints where the rig has any.
+    """Skinning of one body in the rig's bind pose, with twist joints where the rig has any; float64.
 
     Args:
         rig: joints, weights and bind pose.
-        rest: (v, 3) vertices in the bind pose [m]; default: the rig's own bind shape.
+        identity: a body, of batch 1; default: the rig's own bind shape.
     """
 
-    def __init__(
-        self, rig: Rig, rest: np.ndarray | None = None, *, dtype: torch.dtype = torch.float64
-    ) -> None:
+    def __init__(self, rig: Rig, identity: Identity | None = None) -> None:
         engine = Animation if rig.procedural is None else ProceduralAnimation
-        self.animation = engine(rig, dtype=dtype, device=torch.device("cpu"), kernels="auto")
+        self.animation = engine(rig, dtype=torch.float64, device=torch.device("cpu"), kernels="auto")
         self.weights = rig.weights if rig.procedural is None else rig.procedural.weights
-        points = torch.as_tensor(np.array(rig.bind_shape if rest is None else rest)).to(dtype)[None]
-        bind = torch.as_tensor(rig.bind_world.copy()).to(dtype)[None]
+        if identity is None:
+            points, bind = (torch.as_tensor(array.copy()) for array in (rig.bind_shape, rig.bind_world))
+        else:
+            points, bind = (part[0].detach().cpu().double() for part in (identity.rest, identity.bind_world))
         self.identity = Identity(
-            rest=points, bind_world=bind, fitted_rest=points, fitted_world=bind, backend="bind",
-            rig_revision=rig.revision, params={},
+            rest=points[None], bind_world=bind[None], fitted_rest=points[None], fitted_world=bind[None],
+            rig_revision=rig.revision,
         )  # fmt: skip
 
     def transforms(self, relative: Tensor) -> Tensor:

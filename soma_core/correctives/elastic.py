@@ -17,6 +17,7 @@ from soma_core.correctives.masks import find_creases, geodesic_falloff, mesh_edg
 from soma_core.correctives.sections import Sections
 from soma_core.rig.mesh import CanonicalMesh
 from soma_core.rig.skeleton import Rig
+from soma_core.skeleton.identity import Identity
 
 __all__ = ["ElasticSurface"]
 
@@ -49,7 +50,7 @@ class ElasticSurface:
 
     Args:
         mesh, rig: the canonical body; twist joints take part where the rig has any.
-        rest: (v, 3) another body in the bind pose [m].
+        identity: another body than the canonical one, of batch 1.
         kernels: of the frames, see :class:`SurfaceFrames`.
     """
 
@@ -60,11 +61,12 @@ class ElasticSurface:
         mesh: CanonicalMesh,
         rig: Rig,
         *,
-        rest: np.ndarray | None = None,
+        identity: Identity | None = None,
         kernels: Literal["auto", "torch", "warp"] = "auto",
     ) -> None:
-        self.body = BindBody(rig, rest)
+        self.body = BindBody(rig, identity)
         points = self.body.identity.rest[0].numpy()
+        bind_world = self.body.identity.bind_world[0].numpy()
         edges = mesh_edges(mesh)
         laplacian = random_walk(edges, len(points))
         self._frames = SurfaceFrames(
@@ -80,7 +82,7 @@ class ElasticSurface:
         self._adjacency, self._degree = adjacency, degree
         creases = find_creases(rig)
         falloff = geodesic_falloff(mesh, creases, reach=_REACH)
-        self.sections = Sections(points, mesh.triangles, falloff, np.array(creases.joints), rig.bind_world)
+        self.sections = Sections(points, mesh.triangles, falloff, np.array(creases.joints), bind_world)
         self._response = self._volume_response(points)
         weights = self.body.weights
         self.key = content_key(_VERSION, points, weights.data, weights.indices, weights.indptr, edges)

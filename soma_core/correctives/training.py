@@ -47,8 +47,8 @@ class TrainingOptions:
     """
 
     batch: int = 64
-    epochs: int = 60
-    rate: float = 0.01
+    epochs: int = 24
+    rate: float = 0.003
     sparsity: float = 0.01
     patience: int = 8
     ridge: float = 1e-4
