@@ -59,10 +59,30 @@ def _input(config: DictConfig) -> Path:
         raise InputError(
             "input", got="none", expected="a motion file, or a folder of them", fix="Pass input=FILE."
         )
+    _refuse_unused(config)
     path = Path(config.input).expanduser()
     if not path.exists():
         raise AssetError(path, cause="file is missing", fix="Check the path.")
     return path
+
+
+def _refuse_unused(config: DictConfig) -> None:
+    """Refuse settings of the other direction, which would change nothing."""
+    back, method = config.to != "soma", str(config.identity.method)
+    sought = None if method == "known" else method
+    if back:
+        unused, why = {"identity.method": sought, "most_betas": config.most_betas}, f"to={config.to}"
+    else:
+        placed = None if str(config.translation) == "motion" else str(config.translation)
+        unused = {"betas": config.betas, "result": config.result, "translation": placed}
+        if config.backend is not None and sought is None and config.backend.name != "mhr":
+            unused["backend"] = config.backend.name  # a file tells its own model
+        why = "to=soma" if sought else "to=soma and identity=known"
+    for name, value in unused.items():
+        if value is not None:
+            raise InputError(
+                name, got=str(value), expected=f"none with {why}", fix=f"Leave {name.partition('.')[0]} out."
+            )
 
 
 def _convert_folder(config: DictConfig, folder: Path, output: Path) -> None:

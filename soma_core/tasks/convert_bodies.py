@@ -12,10 +12,11 @@ import numpy as np
 from omegaconf import OmegaConf
 from scipy.spatial.transform import Rotation
 
-from soma_core.errors import InputError
+from soma_core.errors import AssetError, InputError
 from soma_core.io.amass import SmplMotion, read_amass
 from soma_core.io.sam3d import Sam3dFrames, read_sam3d
 from soma_core.plugin.errors import BackendError, BrokenBackendError
+from soma_core.plugin.registry import default_registry
 from soma_core.tasks.animate import given_params
 from soma_core.tasks.posed_input import PosedInput
 from soma_core.tasks.posed_model import (
@@ -142,12 +143,30 @@ def sam3d_body(path: Path, config: DictConfig, backends: FitBackends) -> ShownBo
     if known:
         posed = PosedInput(sequence, backend.layer, topology="native")
     else:
+        _check_mhr_pair()
         posed = PosedInput(TransferredSequence(sequence, _MHR), backend.layer, topology="canonical")
     search = {} if known else OmegaConf.to_container(config.identity, resolve=True)
     return ShownBody(
         backend=backend, posed=posed, params=params, search=search, facts={"up": "+y"},
         licence=f"that of {path.name}",
     )  # fmt: skip
+
+
+def _check_mhr_pair() -> None:
+    """Refuse a missing wrap pair, which can be made without the model.
+
+    Raises:
+        AssetError: it is not there.
+    """
+    pair = default_registry().spec(_MHR).wrap
+    for file in () if pair is None else (pair.native, pair.wrap):
+        if not file.is_file():
+            mesh, folder = f"{file.with_name(pair.native.name).stem}.ply", file.parent
+            raise AssetError(
+                file,
+                cause="the wrap of MHR is missing",
+                fix=f"Make it from any neutral MHR mesh of LOD 1: soma wrap native={mesh} out={folder}",
+            )
 
 
 def _known_mhr(

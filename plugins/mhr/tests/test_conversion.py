@@ -8,9 +8,10 @@ import torch
 from omegaconf import OmegaConf
 
 from soma_core.config.schema import ConvertConfig, IdentityMethod
-from soma_core.errors import InputError
+from soma_core.errors import AssetError, InputError
 from soma_core.io import read_motion
 from soma_core.plugin.errors import BackendError
+from soma_core.plugin.registry import Registry
 from soma_core.tasks.convert_file import Converter
 from soma_core.tasks.fit_job import ResultFiles
 from tests.standins.mhr_files import StandIn, mhr_body
@@ -78,5 +79,10 @@ def test_what_is_missing_is_said(data_folder, person, tmp_path, monkeypatch):
     with pytest.raises(InputError, match=r"person\.npz: fps: got none: SAM 3D Body sees pictures.*fps=30"):
         converted(tmp_path, person, fps=None)
     monkeypatch.setenv("SOMA_DATA_DIR", str(tmp_path))
+    monkeypatch.setattr("soma_core.tasks.convert_bodies.default_registry", Registry)
+    with pytest.raises(
+        AssetError, match=r"mhr_neutral\.obj: the wrap of MHR is missing.*native=mhr_neutral\.ply out="
+    ):
+        converted(tmp_path, person, trusted=False, identity={"method": IdentityMethod.backend})
     with pytest.raises(BackendError, match=r"missing.*mhr_model_lod1\.pt.*Or pass identity=unknown"):
         converted(tmp_path, person)
