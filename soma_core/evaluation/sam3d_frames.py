@@ -116,8 +116,8 @@ def run(config: DictConfig) -> Report:
         notes=(
             "Errors against the transferred vertices, mouth and eye bags left out. The body is unposed from "
             "the frames of the person themselves: few frames leave it free to take up what skinning does not "
-            f"explain. Before unposing it is one of the shapes of {config.experiment.backend}. In the picture, "
-            "blue is the target.",
+            f"explain. Before unposing it is one of the shapes of {config.experiment.backend}. In the "
+            "picture, blue is the target.",
         ),
     )
 

@@ -41,10 +41,8 @@ class Body:
 @functools.cache
 def make_body(count: int, face_count: int, components: int = 16) -> Body:
     """Make a body of `count` vertices and `face_count` faces; the last faces go where there are too many."""
-    low = count < 18056
-    layer = SomaLayer(
-        "soma", lod="low" if low else "mid", dtype=torch.float64, kernels="torch", procedural=False
-    )
+    lod = "mid" if count >= 18056 else "low" if count >= 4505 else "xlo"
+    layer = SomaLayer("soma", lod=lod, dtype=torch.float64, kernels="torch", procedural=False)
     coefficients = torch.zeros(components + 1, 128, dtype=torch.float64)
     coefficients[1:, :components] = torch.eye(components, dtype=torch.float64)
     still = torch.zeros(1, len(layer.joint_names), 3, dtype=torch.float64)
@@ -52,7 +50,7 @@ def make_body(count: int, face_count: int, components: int = 16) -> Body:
         identity = layer.identity({"shape": coefficients})
         posed = layer.pose(identity, still)
     points = posed.vertices.numpy()
-    mesh, rig = load_canonical("low" if low else "mid")
+    mesh, rig = load_canonical(lod)
     triangles = mesh.triangles.astype(np.int64)
     split = count - mesh.vertex_count
     assert 0 <= split <= len(triangles), "no such body can be made"
@@ -78,14 +76,15 @@ def make_body(count: int, face_count: int, components: int = 16) -> Body:
 
 
 def surface_wrap(body: Body) -> np.ndarray:
-    """The canonical mid mesh on the facets of the body, its bags apart, (v, 3) [m]."""
+    """The canonical mid mesh on the facets of the body, bags and between toes apart, (v, 3) [m]."""
     layer = SomaLayer("soma", dtype=torch.float64, kernels="torch", procedural=False)
     with torch.no_grad():
         still = torch.zeros(1, len(layer.joint_names), 3, dtype=torch.float64)
         ideal = layer.pose(layer.identity(), still).vertices[0].numpy()
     face = ClosestFaces(body.vertices, body.faces).query(ideal)
     wrap = closest_point_on_triangle(ideal, body.vertices[body.faces[face]])
-    wrap[layer.mesh.face_interior] = ideal[layer.mesh.face_interior]
+    apart = np.union1d(layer.mesh.face_interior, layer.mesh.segments["between_toes"])
+    wrap[apart] = ideal[apart]
     return wrap
 
 
