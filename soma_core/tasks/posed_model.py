@@ -21,7 +21,7 @@ from soma_core.plugin.registry import default_registry
 from soma_core.plugin.spec import HasPosed
 from soma_core.rig import load_canonical
 from soma_core.topology.correspondence import load_correspondence
-from soma_core.topology.frames import METRES
+from soma_core.topology.frames import METRES, native_to_canonical
 from soma_core.topology.transfer import make_transfer
 
 __all__ = ["FitBackend", "FitBackends", "HeldSequence", "ModelSequence", "TransferredSequence"]
@@ -152,11 +152,12 @@ class TransferredSequence(VertexSequence):
             self._transfer = make_transfer(
                 spec, mesh, correspondence, dtype=torch.float32, device=torch.device("cpu")
             )
-        self._sequence, self._unit = sequence, METRES[spec.unit]
+        self._sequence = sequence
+        self._frame = native_to_canonical(spec.up, spec.forward) / METRES[spec.unit]
         super().__init__(
             sequence.path, sequence.frame_count, mesh.vertex_count, fps=sequence.fps, metres=1.0, up="+y"
         )
 
     def _read(self, start: int, stop: int) -> np.ndarray:
-        native = torch.as_tensor(self._sequence.read(start, stop)).float() / self._unit
-        return self._transfer(native).numpy()
+        native = self._sequence.read(start, stop) @ self._frame
+        return self._transfer(torch.as_tensor(native).float()).numpy()
