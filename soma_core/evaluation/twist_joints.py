@@ -92,16 +92,24 @@ def _bodies(layer: SomaLayer, name: str, vertices: dict[str, np.ndarray]) -> lis
     ]
 
 
-def _wrist(layer: SomaLayer, vertices: dict[str, np.ndarray], ends: np.ndarray) -> list[Figure]:
-    """Share of the volume around the wrist that each model loses."""
-    direction = (ends[1] - ends[0]) / np.linalg.norm(ends[1] - ends[0])
-    places = np.linspace(-_WRIST_M, _WRIST_M, 25)
+def _forearm(layer: SomaLayer, vertices: dict[str, np.ndarray], ends: np.ndarray) -> list[Figure]:
+    """Share of the volume around the wrist that each model loses, and of its area at the thinnest section."""
+    length = float(np.linalg.norm(ends[1] - ends[0]))
+    wrist, whole = np.linspace(-_WRIST_M, _WRIST_M, 25), np.linspace(-length, _WRIST_M, 60)
     areas = {
-        key: section_areas(points, layer.mesh.triangles, ends[1], direction, places)
+        key: [
+            section_areas(points, layer.mesh.triangles, ends[1], (ends[1] - ends[0]) / length, places)
+            for places in (wrist, whole)
+        ]
         for key, points in vertices.items()
     }
-    plain, helped = (100 * (1 - areas[model].sum() / areas["rest"].sum()) for model in _MODELS)
+    plain, helped = (100 * (1 - areas[model][0].sum() / areas["rest"][0].sum()) for model in _MODELS)
+    thinnest = [100 * (1 - (areas[model][1] / areas["rest"][1]).min()) for model in _MODELS]
     return [
+        *(
+            Figure(name=f"area lost by the thinnest section of the forearm, {model}", value=value, unit="%")
+            for model, value in zip(_MODELS, thinnest, strict=True)
+        ),
         Figure(name=f"volume lost by the wrist, {_MODELS[0]}", value=plain, unit="%"),
         Figure(
             name=f"volume lost by the wrist, {_MODELS[1]}", value=helped, unit="%", bound=_WRIST_LOSS * plain
@@ -139,7 +147,7 @@ def run(config: DictConfig) -> Report:
         volume = {key: enclosed_volume(points, layer.mesh.triangles) for key, points in vertices.items()}
         rows.append([name, *(_CM3 * (volume["rest"] - volume[model]) for model in _MODELS)])
         bodies += _bodies(layer, name, vertices)
-        figures += _wrist(layer, vertices, ends) if name == "forearm" else []
+        figures += _forearm(layer, vertices, ends) if name == "forearm" else []
     return Report(
         title=f"Twist joints on the default body of {layer.backend}",
         figures=[*figures, *_unchanged(layer)],
