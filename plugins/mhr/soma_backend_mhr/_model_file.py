@@ -26,8 +26,8 @@ _INPUTS = ("identity_coeffs", "model_parameters", "face_expr_coeffs")
 _STATURES_CM = (140, 210)
 """Of the neutral body, which is 173 cm tall."""
 
-_SOLES, _SHINS = 0.04, (0.08, 0.15)
-"""Heights over the ground, in parts of the stature: the feet, and what stands behind their tips."""
+_FEET, _LEGS = (-1.0, 0.06), (0.1, 0.3)
+"""Heights over the ground, in parts of the stature: the feet, and what stands over their heels."""
 
 _PROBES = 2
 """Bodies that are evaluated to check a file: one would not show that it takes a batch."""
@@ -167,8 +167,8 @@ def _check_body(path: Path, lod: Lod, body: Tensor) -> None:
         cause = f"its neutral body measures {extents}, expected {low} to {high} cm along y and less along z"
         raise _refused(path, lod, cause)
     height = (body[:, 1] - body[:, 1].min()) / size[1]
-    feet, shins = height < _SOLES, (height > _SHINS[0]) & (height < _SHINS[1])
-    if not float(body[feet, 2].mean()) > float(body[shins, 2].mean()):
+    feet, legs = (body[(height > low) & (height < high), 2] for low, high in (_FEET, _LEGS))
+    if not float(feet.min() + feet.max()) > float(legs.min() + legs.max()):
         raise _refused(path, lod, "its neutral body does not face +z")
 
 

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import logging
+import os
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+import trimesh
 from soma_backend_mhr import _model_file
 from soma_backend_mhr._files import LOD1, LOD6
 from soma_backend_mhr._model_file import load_model
@@ -166,3 +169,23 @@ def test_every_input_has_a_gradient(data_folder):
     inputs = [torch.zeros(1, width, dtype=torch.float64, requires_grad=True) for width in (45, 204, 72)]
     model.evaluate(*inputs).square().sum().backward()
     assert all(float(each.grad.abs().sum()) > 0 for each in inputs)
+
+
+DATA = Path(os.environ.get("SOMA_TEST_DATA", "")) / "mhr"
+
+
+@pytest.mark.skipif(
+    not (DATA / "mhr_neutral_lod1.ply").is_file(), reason="needs SOMA_TEST_DATA with mhr/mhr_neutral_lod1.ply"
+)
+@pytest.mark.parametrize("lod", [LOD1, LOD6])
+def test_the_neutral_body_of_mhr_itself_is_accepted(tmp_path, lod):
+    """In a file that answers with it; LOD 6 by the published map of its vertices onto LOD 1."""
+    neutral = trimesh.load(DATA / "mhr_neutral_lod1.ply", process=False, maintain_order=True)
+    vertices, faces = torch.tensor(neutral.vertices), torch.tensor(neutral.faces)
+    if lod is LOD6:
+        mapped = np.load(DATA / "lod1_to_lod6_mapping.npz")
+        corners = vertices[faces[mapped["triangle_ids"]]]
+        vertices = (corners * torch.tensor(mapped["baryc_coords"])[..., None]).sum(1)
+        faces = torch.tensor(mhr_body(6).faces)  # whose vertices they join does not matter here
+    path = write_model(tmp_path / lod.models[0], Answer(vertices.float(), faces.long()))
+    assert load(path, lod).faces.shape == faces.shape
