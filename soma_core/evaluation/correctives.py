@@ -172,7 +172,7 @@ def _seconds(call: Callable[[], Tensor], repeats: int = 5) -> float:
 
 
 def _bodies(subject: _Subject, motion: np.ndarray) -> tuple[list[list[str | float | None]], list[ShownBody]]:
-    """The same correctives on other bodies: error to a teacher of the body's own, and pictures of one pose."""
+    """The same correctives on other bodies: error to a teacher of their own, and pictures of one pose."""
     rows: list[list[str | float | None]] = []
     shown = []
     frame = motion[len(motion) * 3 // 4][None]
