@@ -15,6 +15,7 @@ from soma_core.geometry.rotations import matrix_to_axis_angle
 from soma_core.inversion._inputs import check_weights
 from soma_core.layer import Kernels
 from soma_core.native.blend import BlendMoments
+from soma_core.native.implicit import attach_gradient
 from soma_core.native.model import NativeBody, NativeRig
 from soma_core.native.motion import NativeMotion
 from soma_core.native.poses import PoseFit
@@ -97,7 +98,6 @@ class NativeFit(torch.nn.Module):
         self.rig = NativeRig(self._model(self._one_body({})), self.scale, covered, kernels=kernels, **kind)
         self.joint_names = self.rig.joint_names
 
-    @torch.no_grad()
     def forward(
         self,
         vertices: Tensor,
@@ -114,11 +114,16 @@ class NativeFit(torch.nn.Module):
                 :meth:`fit_params` for those of an unknown body.
             weights: (n,) of native vertices, default 1; those without a counterpart never count.
 
+        Returns:
+            Rotations, translation and vertices carry gradients by `vertices` (the implicit derivative of the
+            minimum: exact where the fit is, Gauss-Newton elsewhere); the report does not.
+
         Raises:
             InputError: a wrong shape, a negative weight, or parameters of several bodies.
         """
         target = self._native(vertices)
-        fit = self._prepared(self._one_body(params), self._weights(weights))
+        with torch.no_grad():
+            fit = self._prepared(self._one_body(params), self._weights(weights))
         return _joined([self._fit(fit, part) for part in target.split(_CHUNK)])
 
     @torch.no_grad()
@@ -224,16 +229,20 @@ class NativeFit(torch.nn.Module):
         """Fit a chunk of frames (F, n, 3) [m]."""
         near, origin, known = _finite(fit.body, target, fit.weights)
         valid = known.any(1)
-        pose = fit(near)
-        posed = fit.posed(pose)
-        error = torch.linalg.vector_norm(posed - near, dim=-1)
+        with torch.no_grad():
+            pose = fit(near.detach())
+        rotations, pelvis = pose.relative[:, 1:], pose.translation
+        if torch.is_grad_enabled() and near.requires_grad:
+            rotations, pelvis = attach_gradient(near, pose, fit, valid)
+        posed = self.rig.posed(fit.body, rotations, pelvis)
+        error = torch.linalg.vector_norm(posed.detach() - near.detach(), dim=-1)
         residual = (error.square() @ fit.weights / fit.weights.sum()).sqrt()
         determined = torch.zeros(len(self.joint_names), dtype=torch.bool, device=self.device)
         determined[self.rig.solver.variables - 1] = True
-        translation = (pose.translation + origin - fit.body.pelvis) / self.scale
+        translation = (pelvis + origin - fit.body.pelvis) / self.scale
         return NativeMotion(
             joint_names=self.joint_names,
-            rotations=matrix_to_axis_angle(pose.relative[:, 1:]).masked_fill(~valid[:, None, None], 0),
+            rotations=matrix_to_axis_angle(rotations).masked_fill(~valid[:, None, None], 0),
             translation=translation.masked_fill(~valid[:, None], 0),
             params=fit.body.params,
             vertices=(posed + origin[:, None]) / self.scale,

@@ -66,6 +66,15 @@ class PoseFit:
         )  # fmt: skip
         return whole(pose, iterations=self._iterations, tolerance=self._tolerance)
 
+    def matrix(self, pose: Pose, turns: Tensor, places: Tensor) -> Tensor:
+        """Gauss-Newton matrix (F, n + 1, 3, n + 1, 3) of the whole model at poses with these joints."""
+        solver = self.rig.solver
+        none = turns.new_zeros(len(turns), len(solver.joints), 3, 4)
+        matrix, _ = solver.normal_equations(turns, places, self.rest.second, none)
+        if self.blend is None:
+            return matrix
+        return matrix + self.blend.matrix(pose.relative, turns, places, solver)
+
     def posed(self, pose: Pose) -> Tensor:
         """Vertices (F, n, 3) [m] of poses."""
         return self.rig.posed(self.body, pose.relative[:, 1:], pose.translation)

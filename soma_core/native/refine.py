@@ -11,30 +11,13 @@ from soma_core.inversion.moments import RestMoments
 from soma_core.inversion.problem import Pose
 from soma_core.native.blend import BlendMoments
 from soma_core.native.model import NativeBody, NativeRig
+from soma_core.native.view import View, view_pose
 
 __all__ = ["Refinement"]
 
 _START_DAMPING = 1e-4
 _LOWER, _RAISE, _MOST_DAMPING = 0.2, 4.0, 1e6
 """Levenberg damping, relative to the diagonal: start, factors after a good and a bad step, largest value."""
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class _View:
-    """A pose under the whole model.
-
-    Attributes:
-        energy: (F,) [m^2], float64.
-        slope: half its derivative by turns in world axes, and by the translation, (F, n + 1, 3).
-        spread: sums of arm times residual of each joint's subtree about it, (F, J, 3, 3).
-        turns, places: of the joints, (F, J, 3, 3) and (F, J, 3).
-    """
-
-    energy: Tensor
-    slope: Tensor
-    spread: Tensor
-    turns: Tensor
-    places: Tensor
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -69,7 +52,7 @@ class Refinement:
         """
         mass = self.weights.sum()
         pose = replace(start, accepted=torch.zeros_like(start.accepted))
-        view = self._look(pose)
+        view = self._view(pose)
         damping = torch.full_like(start.last_change, _START_DAMPING)
         raising = torch.full_like(damping, _RAISE)
         moving = torch.ones_like(start.accepted, dtype=torch.bool)
@@ -78,7 +61,7 @@ class Refinement:
             matrix = self._matrix(view) + shaped
             step = self.rig.solver.damped_step(matrix, view.slope, damping)
             trial = self.rig.solver.retract(pose, view.turns, step)
-            seen = self._look(trial)
+            seen = self._view(trial)
             change = seen.energy - view.energy
             flat = step.flatten(1)
             bent = (matrix.flatten(3, 4).flatten(1, 2) @ flat[..., None]).squeeze(-1)
@@ -92,7 +75,7 @@ class Refinement:
                 last_change=torch.where(moving, last, pose.last_change),
             )
             parts = vars(seen).items()
-            view = _View(**{name: _chosen(better, value, getattr(view, name)) for name, value in parts})
+            view = View(**{name: _chosen(better, value, getattr(view, name)) for name, value in parts})
             lower = (1 - (2 * gain - 1) ** 3).clamp(1 / 5, 2).to(damping)
             damping = (damping * torch.where(better, lower, raising)).clamp_max(_MOST_DAMPING)
             raising = torch.where(better, _RAISE, 2 * raising)
@@ -101,7 +84,10 @@ class Refinement:
                 break
         return pose
 
-    def _matrix(self, view: _View) -> Tensor:
+    def _view(self, pose: Pose) -> View:
+        return view_pose(self.rig, self.body, self.rest, pose, self.target, self.weights)
+
+    def _matrix(self, view: View) -> Tensor:
         """Gauss-Newton matrix (F, n + 1, 3, n + 1, 3) of the skinning, with the residual's own curvature.
 
         A residual bends the path of each joint's points. Only what raises the energy is added: the matrix
@@ -117,37 +103,6 @@ class Refinement:
         each = torch.arange(bend.shape[1], device=bend.device)
         matrix[:, each, :, each] += bend.transpose(0, 1)
         return matrix
-
-    def _look(self, pose: Pose) -> _View:
-        rotations = pose.relative[:, 1:].detach().requires_grad_()
-        pelvis = pose.translation.detach().requires_grad_()
-        with torch.enable_grad():
-            step = self.rig.posed(self.body, rotations, pelvis) - self.target
-            energy = (self.weights * step.square().sum(-1)).double().sum(1)
-            by_rotations, by_pelvis = torch.autograd.grad(energy.sum(), (rotations, pelvis))
-        turns, places = self.rig.solver.walk(pose, self.rest.offsets)
-        n = self.rig.solver.variables
-        torque = (
-            turns[:, self.rig.solver.parents[n]]
-            @ _torque(rotations.detach(), by_rotations)[:, n - 1, :, None]
-        )
-        slope = 0.5 * torch.cat((torque.squeeze(-1), by_pelvis[:, None]), 1)
-        residual = self.rig.moments.of_vectors(step.detach(), self.rest)
-        spread, _ = self.rig.solver.subtree_forces(turns, places, residual)
-        return _View(energy=energy.detach(), slope=slope, spread=spread, turns=turns, places=places)
-
-
-def _torque(rotations: Tensor, slope: Tensor) -> Tensor:
-    """Derivative (..., 3) by turns ahead of rotations (..., 3, 3) from that by their entries."""
-    product = rotations @ slope.transpose(-1, -2)
-    return torch.stack(
-        (
-            product[..., 1, 2] - product[..., 2, 1],
-            product[..., 2, 0] - product[..., 0, 2],
-            product[..., 0, 1] - product[..., 1, 0],
-        ),
-        -1,
-    )
 
 
 def _chosen(better: Tensor, new: Tensor, old: Tensor) -> Tensor:

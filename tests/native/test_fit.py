@@ -118,3 +118,15 @@ def test_refusals(fit, vertices):
         fit.fit_params(vertices * torch.nan)
     with pytest.raises(InputError, match=r"weights: got \(7,\)"):
         fit(vertices, weights=torch.ones(7))
+
+
+def test_gradients_reach_the_canonical_vertices(fit, vertices, motion):
+    tracked = vertices[:1].clone().requires_grad_()
+    found = fit(tracked, params=motion.params)
+    assert not found.vertex_error.requires_grad
+    shift = torch.tensor([0.3, -0.2, 0.5])
+    (slope,) = torch.autograd.grad((found.translation @ shift).sum(), tracked)
+    # Moving every vertex moves the body by as much.
+    torch.testing.assert_close(slope.sum((0, 1)), shift, atol=1e-3, rtol=0)
+    (slope,) = torch.autograd.grad(fit(tracked, params=motion.params).rotations.square().sum(), tracked)
+    assert bool(slope.isfinite().all())
