@@ -81,9 +81,9 @@ class ProceduralDefinition:
                     chained[row, names.index(column)] = share
                 else:
                     public[row, joint_names.index(column)] = share
-        total, step = public, public
-        while (step := chained @ step).any():  # ends, as no helper is placed by itself
-            total = total + step
+        total = public
+        for _ in names:  # as long as the longest chain can be
+            total = public + chained @ total
         return total
 
 

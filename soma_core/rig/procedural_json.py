@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-import math
+import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -86,7 +86,7 @@ class _Field:
         """The value as a finite number."""
         if isinstance(self.value, bool) or not isinstance(self.value, int | float):
             raise self.refuse("a number")
-        if not math.isfinite(self.value):
+        if not abs(self.value) <= sys.float_info.max:  # JSON may hold NaN, infinity and any integer
             raise self.refuse("a finite number")
         return float(self.value)
 

@@ -22,6 +22,8 @@ from soma_core.io.sam3d import read_sam3d
 from soma_core.rig.legacy import read_legacy_rig
 from soma_core.rig.manifest import MANIFEST_NAME, read_manifest
 from soma_core.rig.neutral import load_shape_space, read_topology
+from soma_core.rig.procedural_json import read_procedural
+from soma_core.rig.twist_template import procedural_document
 from soma_core.rig.usd import read_usd_rig
 from soma_core.topology.wrap_pair import read_obj
 from tests.standins.pickles import ch, csc, select, write_pickle
@@ -201,6 +203,13 @@ def _json(path: Path) -> None:
     path.write_text(json.dumps({"schema": 1, "rig_hash": "a", "rig_revision": "b", "files": {}}))
 
 
+def _procedural(path: Path) -> None:
+    sides = [f"{side}{name}" for side in ("Left", "Right") for name in ("Shoulder", *_LIMBS)]
+    path.write_text(json.dumps(procedural_document(["Root", "Hips", *sides])))
+
+
+_LIMBS = ("Arm", "ForeArm", "Hand", "Leg", "Shin", "Foot")
+
 READERS = [
     Reader(name="wrap pair", suffix=".obj", read=read_obj, good=_obj),
     Reader(
@@ -240,6 +249,7 @@ READERS = [
     Reader(name="topology", suffix=".npz", read=read_topology),
     Reader(name="legacy rig", suffix=".npz", read=read_legacy_rig, good=_legacy),
     Reader(name="usd rig", suffix=".usda", read=read_usd_rig, good=_usd),
+    Reader(name="procedural definition", suffix=".json", read=read_procedural, good=_procedural),
     Reader(name="manifest", suffix=".json", read=_manifest, good=_json),
     Reader(
         name="pickle", suffix=".pkl",
