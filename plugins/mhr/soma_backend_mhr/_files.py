@@ -61,7 +61,11 @@ LOD1 = Lod(
     hashes=("352e271a6c42729c68554ceaea0c955e866970160c31e35506d782dc0f7377bc",),
     size="696 MB",
     models=("mhr_model_lod1.pt", "mhr_model.pt"),
-    pairs=(("base_body_lod1.obj", "SOMA_wrap_lod1.obj"), ("mhr_neutral.obj", "SOMA_wrap.obj")),
+    pairs=(
+        ("base_body_lod1.obj", "SOMA_wrap_lod1.obj"),
+        ("mhr_neutral_lod1.obj", "SOMA_wrap.obj"),  # made of the published mesh, without the model
+        ("mhr_neutral.obj", "SOMA_wrap.obj"),
+    ),
 )
 LOD6 = Lod(
     number=6,
