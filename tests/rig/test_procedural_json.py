@@ -165,7 +165,7 @@ ROTATION, TRANSLATION = (f"parameter_matrices.{kind}" for kind in ("rotation", "
         (f"{ROTATION}.entries[5].column", "LeftArmTwist1", r"entries\[5\]\.column is 'LeftArmTwist1'"),
         (f"{ROTATION}.entries[5].column", "Head", r"\(row LeftArmTwist3, column Head\) is .*the end joint"),
         (f"{ROTATION}.entries[5].value", "1", r"rotation\.entries\[5\]\.value is '1', expected a number"),
-        (f"{ROTATION}.entries[5].value", 10**400, r"entries\[5\]\.value is 1000+\.\.\., expected a finite number"),
+        (f"{ROTATION}.entries[5].value", 10**400, r"entries\[5\]\.value is 1000+\.\.\., .*finite"),
         (f"{ROTATION}.entries[5].value", float("nan"), r"rotation\.entries\[5\]\.value is nan, .*finite"),
         (f"{ROTATION}.entries[5]", ENTRY, r"entries\[5\] is \{'row': .*one entry for row LeftArmTwist1"),
         (f"{TRANSLATION}.entries[1].value", 0.5, r"entries \(sum of row LeftArmTwist1\) is 1\.45"),
