@@ -26,6 +26,7 @@ from soma_core.tasks.animate import animate, given_params
 from soma_core.tasks.convert_file import Converted, earlier_report, layout_of, motion_of
 from soma_core.tasks.fit_job import ResultFiles, fingerprint
 from soma_core.tasks.fitted_chunks import FittedChunks
+from soma_core.tasks.native_errors import NativeErrors
 from soma_core.tasks.native_results import NativeTarget, SmplTarget, VertexTarget
 from soma_core.tasks.stored_identity import stored_identity
 
@@ -148,8 +149,10 @@ class BackConverter:
         params = {"betas": list(config.betas)} if config.betas is not None else own.get("params")
         if gender not in self._targets:
             self._targets[gender] = NativeFit(name, options={"gender": gender}, **kind)
+        fit = self._targets[gender]
+        errors = NativeErrors(fit.transfer, kind["lod"])
         return SmplTarget(
-            fit=self._targets[gender], model=name, gender=gender, up=f"+{config.up or 'z'}", params=params
+            fit=fit, errors=errors, model=name, gender=gender, up=f"+{config.up or 'z'}", params=params
         )
 
 

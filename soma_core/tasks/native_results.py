@@ -12,20 +12,20 @@ import torch
 from torch import Tensor
 
 from soma_core.cache import atomic_write
-from soma_core.inversion.histogram import bin_counts, quantile
 from soma_core.io.amass import Gender, SmplMotion, SmplName, write_amass
 from soma_core.io.npz_parts import write_npz_parts
 from soma_core.io.soma_npz import METRES_PER_UNIT
 from soma_core.io.vertex_sequence import UpAxis
-from soma_core.native import NativeFit, NativeMotion, NativeTransfer
+from soma_core.native import NativeFit, NativeTransfer
 from soma_core.tasks.fit_job import ResultFiles
 from soma_core.tasks.fitted_chunks import FittedChunks
+from soma_core.tasks.native_errors import NativeErrors
 from soma_core.topology.frames import METRES, native_to_canonical
 
 __all__ = ["NativeTarget", "SmplTarget", "VertexTarget"]
 
-_MM = 1e3
 _PER_FRAME = ("valid", "converged", "iterations", "mean_error", "largest_error")
+_SUMMED = ("sums", "numbers", "counts", "maxima")
 
 
 class NativeTarget(Protocol):
@@ -77,12 +77,14 @@ class SmplTarget:
 
     Attributes:
         fit: to the model.
+        errors: by regions of its mesh.
         model, gender: which it is.
         params: the body; None while it is yet to be found.
         up: upward axis of the world that is written.
     """
 
     fit: NativeFit
+    errors: NativeErrors
     model: SmplName
     gender: Gender
     params: Mapping[str, list[float]] | None
@@ -104,7 +106,10 @@ class SmplTarget:
             "rotations": found.rotations.float().cpu().numpy(),
             "translation": found.translation.float().cpu().numpy(),
             "determined": found.determined.cpu().numpy(),
-            **_statistics(found),
+            "valid": found.valid.cpu().numpy(),
+            "converged": found.converged.cpu().numpy(),
+            "iterations": found.iterations.cpu().numpy(),
+            **self.errors.statistics(found.vertex_error.float().cpu().numpy()),
         }
 
     def write(self, chunks: FittedChunks, files: ResultFiles, *, fps: float, source: str) -> dict[str, Any]:
@@ -120,47 +125,17 @@ class SmplTarget:
         return self._figures(chunks, frames)
 
     def _figures(self, chunks: FittedChunks, frames: Mapping[str, np.ndarray]) -> dict[str, Any]:
-        total, number, counts = (sum(_column(chunks, name)) for name in ("sum", "number", "counts"))
+        parts = [dict(zip(_SUMMED, arrays, strict=True)) for arrays in chunks.load_all(*_SUMMED)]
         (determined,) = chunks.load(0, "determined")
-        valid = int(frames["valid"].sum())
-        largest = float(np.nanmax(frames["largest_error"], initial=0)) if valid else np.nan
-        values = (
-            total / number if number else np.nan,
-            quantile(counts, 0.5),
-            quantile(counts, 0.95),
-            largest,
-        )
-        error = {
-            name: _MM * float(value) if valid else None
-            for name, value in zip(("mean", "median", "p95", "max"), values, strict=True)
-        }
         names = zip(self.fit.joint_names, determined, strict=True)
+        valid = int(frames["valid"].sum())
         return {
             "frames": chunks.frame_count,
             "unusable_frames": chunks.frame_count - valid,
             "converged_share": int(frames["converged"].sum()) / valid if valid else None,
             "undetermined_joints": [name for name, known in names if not known],
-            "error_mm": {"all": error},
+            "error_mm": self.errors.figures(parts),
         }
-
-
-def _statistics(found: NativeMotion) -> dict[str, np.ndarray]:
-    """Of each frame, and sums over the vertices of all that can be joined."""
-    error = found.vertex_error.float().cpu().numpy()
-    known = np.isfinite(error)
-    number = known.sum(axis=1)
-    zeroed = np.where(known, error, 0)
-    usable = number > 0
-    return {
-        "valid": found.valid.cpu().numpy(),
-        "converged": found.converged.cpu().numpy(),
-        "iterations": found.iterations.cpu().numpy(),
-        "mean_error": np.where(usable, zeroed.sum(axis=1) / np.maximum(number, 1), np.nan).astype(np.float32),
-        "largest_error": np.where(usable, zeroed.max(axis=1), np.nan).astype(np.float32),
-        "sum": zeroed.sum(dtype=np.float64),
-        "number": number.sum(),
-        "counts": bin_counts(error[known]),
-    }
 
 
 def _column(chunks: FittedChunks, name: str) -> Iterator[np.ndarray]:

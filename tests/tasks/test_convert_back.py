@@ -51,6 +51,9 @@ def test_an_amass_motion_comes_back(smplh_models, fitted, amass, tmp_path):
     assert 1e3 * distance.mean() < THERE_AND_BACK_MM
     assert found.report["frames"] == AMASS_FRAMES
     assert found.report["unusable_frames"] == 0
+    regions = found.report["error_mm"]
+    assert list(regions)[:5] == ["all", "body", "hands", "feet", "head"]
+    assert regions["all"]["max"] == max(regions[name]["max"] for name in ("body", "hands", "feet", "head"))
     assert 0 < found.error_mm["median"] < found.error_mm["p95"] < found.error_mm["max"]
     with np.load(tmp_path / "frames.npz") as frames:
         assert 1e3 * frames["mean_error"].mean() == pytest.approx(found.error_mm["mean"], rel=1e-3)
