@@ -33,14 +33,20 @@ def public_rig(path: Path, stored: StoredRig, definition: ProceduralDefinition) 
     """Fold every joint that no pose controls into its nearest public ancestor.
 
     Raises:
-        AssetError: the skeleton lacks a public joint or a twist joint of the definition.
+        AssetError: the skeleton lacks a public joint or a twist joint of the definition, or has another
+            number of joints than it was made for.
     """
+    fix = "Use the definition that was made for this rig"
+    count = len(stored.joint_names)
+    if definition.joint_count not in (None, count):
+        cause = f"the skeleton has {count} joints, the definition is for {definition.joint_count}"
+        raise AssetError(path, cause=cause, fix=fix)
     missing = [
         name for name in (*definition.main_joints, *definition.helpers) if name not in stored.joint_names
     ]
     if missing:
         cause = f"the skeleton lacks {len(missing)} joints of the procedural definition, first {missing[0]}"
-        raise AssetError(path, cause=cause, fix="Use the definition that was made for this rig")
+        raise AssetError(path, cause=cause, fix=fix)
     return stored.keep(definition.main_joints)
 
 

@@ -49,6 +49,7 @@ class ProceduralDefinition:
         modes: how the twist of each helper is read.
         rotation: helper -> {public joint -> factor of its twist channel in the helper's angle}.
         translation: helper -> {public joint or helper -> share of its bind position}; shares sum to 1.
+        joint_count: number of joints of the skeleton it was made for, where it says so.
     """
 
     main_joints: tuple[str, ...]
@@ -56,6 +57,7 @@ class ProceduralDefinition:
     modes: Mapping[str, TwistMode]
     rotation: Mapping[str, Mapping[str, float]]
     translation: Mapping[str, Mapping[str, float]]
+    joint_count: int | None = None
 
     @property
     def helpers(self) -> tuple[str, ...]:

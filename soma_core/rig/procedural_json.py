@@ -228,6 +228,17 @@ def _check_channels(field: _Field, definition: ProceduralDefinition) -> None:
                 )
 
 
+def _joint_count(root: _Field, least: int) -> int | None:
+    """Number of joints of the template, where it is stated."""
+    template = root.at("template_asset")
+    count = None if template.value is None else template.at("joint_count")
+    if count is None or count.value is None:
+        return None
+    if isinstance(count.value, bool) or not isinstance(count.value, int) or count.value < least:
+        raise count.refuse(f"at least the {least} joints that the definition names")
+    return count.value
+
+
 def parse_procedural(document: object, file: Path) -> ProceduralDefinition:
     """Check the content of a procedural definition.
 
@@ -253,6 +264,7 @@ def parse_procedural(document: object, file: Path) -> ProceduralDefinition:
         modes=_modes(root, helpers),
         rotation=_matrix(matrices.at("rotation"), helpers, public),
         translation=_matrix(matrices.at("translation"), helpers, (*public, *helpers)),
+        joint_count=_joint_count(root, len(public) + len(helpers)),
     )
     _check_places(matrices.at("translation").at("entries"), definition.translation, helpers)
     _check_channels(matrices.at("rotation").at("entries"), definition)

@@ -97,6 +97,12 @@ def test_axes_may_be_numbers(document):
     assert {(segment.axis, segment.sign) for segment in definition.segments} == {(2, -1)}
 
 
+@pytest.mark.parametrize("template", [{}, {"file": "a.usda"}])
+def test_a_template_may_be_left_unsaid(document, template):
+    definition = parse_procedural(document | {"template_asset": template}, Path("x"))
+    assert definition.joint_count is None
+
+
 def test_a_later_minor_version_and_unknown_fields_are_read(document):
     document |= {"schema_version": "1.7.3", "more": {"of": "it"}}
     assert len(parse_procedural(document, Path("x")).segments) == 8
@@ -156,6 +162,9 @@ ROTATION, TRANSLATION = (f"parameter_matrices.{kind}" for kind in ("rotation", "
         ("segments[4].source_sign", 2, r"segments\[4\]\.source_sign is 2, expected 1 or -1"),
         ("segments[1].twist_joints[2]", 7, r"segments\[1\]\.twist_joints\[2\] is 7"),
         ("parameter_matrices", None, r"parameter_matrices is None, expected an object"),
+        ("template_asset.joint_count", 109, r"template_asset\.joint_count is 109, .*the 110 joints"),
+        ("template_asset.joint_count", "110", r"template_asset\.joint_count is '110'"),
+        ("template_asset", "a.usda", r"template_asset is 'a\.usda', expected an object"),
         (f"{ROTATION}.format", "dense", r"rotation\.format is 'dense', expected 'sparse_coo_named'"),
         (f"{ROTATION}.dtype", "int8", r"rotation\.dtype is 'int8', expected 'float32'"),
         (f"{ROTATION}.entries", [], r"rotation\.entries is \[\]"),
