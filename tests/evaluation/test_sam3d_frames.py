@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 
 import numpy as np
@@ -12,13 +11,13 @@ from omegaconf import OmegaConf
 
 from soma_core.errors import AssetError, InputError
 from soma_core.evaluation import sam3d_frames
-from soma_core.evaluation.sam3d_frames import NEUTRAL, Wrap
+from soma_core.evaluation.sam3d_frames import Wrap
 from soma_core.rig import load_canonical
 from soma_core.topology.correspondence import build_correspondence
+from tests.real_mhr import NEUTRAL, needs_mhr, registered_mhr
 from tests.standins.body import surface_wrap
 from tests.standins.mhr_files import StandIn, mhr_body
 
-DATA = Path(os.environ.get("SOMA_TEST_DATA", ""))
 BOUND_MM = 7.0
 OWN_MM = 3.0
 """A body of this project's own shape space, skinned alike: what one frame and low LOD leave."""
@@ -44,7 +43,7 @@ def test_the_data_must_be_named_and_there(tmp_path, monkeypatch):
     with pytest.raises(AssetError, match=r"mhr_neutral_lod1.ply: file is missing. Name a folder"):
         sam3d_frames.run(configured(tmp_path))
     (tmp_path / "mhr").mkdir()
-    (tmp_path / NEUTRAL).write_bytes(b"ply")
+    (tmp_path / sam3d_frames.NEUTRAL).write_bytes(b"ply")
     monkeypatch.setenv("SOMA_TEST_DATA", str(tmp_path))
     with pytest.raises(AssetError, match=r"mhr: holds no sam3d_\*.npz"):
         sam3d_frames.run(configured(None))
@@ -55,7 +54,7 @@ def person(tmp_path) -> Path:
     """A folder with one person, posed by a stand-in for MHR."""
     folder = tmp_path / "mhr"
     folder.mkdir()
-    (tmp_path / NEUTRAL).write_bytes(b"ply")
+    (tmp_path / sam3d_frames.NEUTRAL).write_bytes(b"ply")
     random = torch.Generator().manual_seed(0)
     parameters = torch.zeros(1, 204)
     parameters[:, 6:130] = 0.15 * torch.randn(1, 124, generator=random)
@@ -88,8 +87,9 @@ def test_a_person_is_found_and_shown(person, monkeypatch, low):
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(not (DATA / NEUTRAL).is_file(), reason=f"needs SOMA_TEST_DATA with {NEUTRAL}")
-def test_the_published_frames(low):
-    report = sam3d_frames.run(configured(DATA))
+@needs_mhr
+def test_the_published_frames(low, monkeypatch):
+    monkeypatch.setattr(sam3d_frames, "register", lambda *_: registered_mhr())
+    report = sam3d_frames.run(configured(NEUTRAL.parents[1]))
     assert len(report.tables) == 2
     assert not report.failed, report.as_markdown()

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +13,7 @@ from soma_core.registration.quality import Quality, measure
 from soma_core.registration.register import Registration, WrapOptions, register
 from soma_core.rig import load_canonical
 from soma_core.topology.wrap_pair import check_order, read_obj
+from tests.real_mhr import needs_mhr, registered_mhr
 from tests.registration.test_target import sphere
 
 # Bounds of the acceptance of `soma wrap`; what is reached is several times better.
@@ -25,8 +25,6 @@ SIDES_MM = 0.01  # both sides of a symmetric body, where they were projected one
 
 TO_NATIVE = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
 """+Y up, facing +Z to +Z up, facing -Y."""
-
-MHR = Path(os.environ.get("SOMA_TEST_DATA", "")) / "mhr" / "mhr_neutral_lod1.ply"
 
 
 @pytest.fixture(scope="module")
@@ -88,12 +86,9 @@ def test_both_sides_are_alike(anny: Registration) -> None:
     assert 1000 * np.median(difference) < SIDES_MM
 
 
-@pytest.mark.skipif(not MHR.is_file(), reason=f"needs SOMA_TEST_DATA with {MHR}")
+@needs_mhr
 def test_a_body_that_our_shape_space_was_not_trained_on() -> None:
-    import trimesh
-
-    loaded = trimesh.load(MHR, process=False, maintain_order=True)
-    found = register(np.asarray(loaded.vertices, np.float64), np.asarray(loaded.faces))
+    found = registered_mhr()
     assert (found.frame.unit, found.frame.up, found.frame.forward) == ("cm", "+y", "+z")
     numbers = measure(found, load_canonical("mid")[0]).as_dict()
     assert numbers["surface_distance_mm"]["mean"] < MHR_SURFACE_MM

@@ -16,6 +16,9 @@ __all__ = ["BONE_LENGTHS", "POSE", "SCALES", "MhrGenerator"]
 POSE, BONE_LENGTHS, SCALES = 130, 6, 68
 """The 204 model parameters in their order: pose, bone lengths, scales."""
 
+_ROOT, _SPREAD, _LARGEST = 6, 0.6, 1.6
+"""Parameters of the root; standard deviation and largest value of an angle [rad]."""
+
 
 class MhrGenerator:
     """MHR; centimetres, +Y up, facing +Z, in the A-pose that its zero is.
@@ -61,6 +64,16 @@ class MhrGenerator:
         count = max(sizes, default=1)
         shared = {name: value.expand(count, -1) for name, value in params.items()}
         return self._evaluate(shared, parameters.expand(count, -1), expression.expand(count, -1))
+
+    def random_poses(self, count: int, seed: int) -> dict[str, Tensor]:
+        """Poses for :meth:`posed`: joint angles about zero, the root at rest.
+
+        Every pose is active to a degree of its own, so that mild and extreme ones are both met.
+        """
+        random = torch.Generator().manual_seed(seed)
+        angles = torch.randn(count, POSE, generator=random) * torch.rand(count, 1, generator=random)
+        angles[:, :_ROOT] = 0
+        return {"parameters": (_SPREAD * angles).clamp(-_LARGEST, _LARGEST).to(self._device)}
 
     def triangles(self) -> Tensor:
         """Native vertex ids (t, 3)."""

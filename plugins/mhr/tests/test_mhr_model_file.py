@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import logging
-import os
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -18,6 +16,7 @@ from torch import Tensor, nn
 
 from soma_core.cache import file_sha256
 from soma_core.errors import AssetError
+from tests.real_mhr import NEUTRAL, needs_mhr
 from tests.standins.mhr_files import mhr_body, write_model
 
 CPU = torch.device("cpu")
@@ -171,19 +170,14 @@ def test_every_input_has_a_gradient(data_folder):
     assert all(float(each.grad.abs().sum()) > 0 for each in inputs)
 
 
-DATA = Path(os.environ.get("SOMA_TEST_DATA", "")) / "mhr"
-
-
-@pytest.mark.skipif(
-    not (DATA / "mhr_neutral_lod1.ply").is_file(), reason="needs SOMA_TEST_DATA with mhr/mhr_neutral_lod1.ply"
-)
+@needs_mhr
 @pytest.mark.parametrize("lod", [LOD1, LOD6])
 def test_the_neutral_body_of_mhr_itself_is_accepted(tmp_path, lod):
     """In a file that answers with it; LOD 6 by the published map of its vertices onto LOD 1."""
-    neutral = trimesh.load(DATA / "mhr_neutral_lod1.ply", process=False, maintain_order=True)
+    neutral = trimesh.load(NEUTRAL, process=False, maintain_order=True)
     vertices, faces = torch.tensor(neutral.vertices), torch.tensor(neutral.faces)
     if lod is LOD6:
-        mapped = np.load(DATA / "lod1_to_lod6_mapping.npz")
+        mapped = np.load(NEUTRAL.with_name("lod1_to_lod6_mapping.npz"))
         corners = vertices[faces[mapped["triangle_ids"]]]
         vertices = (corners * torch.tensor(mapped["baryc_coords"])[..., None]).sum(1)
         faces = torch.tensor(mhr_body(6).faces)  # whose vertices they join does not matter here
