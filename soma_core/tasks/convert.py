@@ -96,11 +96,13 @@ def _convert_folder(config: DictConfig, folder: Path, output: Path) -> None:
             fix="Name the folder that holds them.",
         )
     convert, rows, errors = _converter(config), {}, []
-    for number, file in enumerate(files, start=1):
-        name = file.relative_to(folder.resolve()).as_posix()
-        rows[name], told = _row(convert, file, output, name, errors)
-        level = logging.WARNING if rows[name]["state"] == _FAILED else logging.INFO
-        _log.log(level, "%d of %d: %s: %s", number, len(files), name, told)
+    try:
+        for number, file in enumerate(files, start=1):
+            name = file.relative_to(folder.resolve()).as_posix()
+            rows[name], told = _row(convert, file, output, name, errors)
+            level = logging.WARNING if rows[name]["state"] == _FAILED else logging.INFO
+            _log.log(level, "%d of %d: %s: %s", number, len(files), name, told)
+    finally:
         _write_rows(output / "report.json", folder, rows)
     shutil.rmtree(output / "chunks", ignore_errors=True)
     counts = Counter(row["state"] for row in rows.values())
