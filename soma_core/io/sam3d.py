@@ -17,6 +17,7 @@ from soma_core.io.npz_fields import NpzFields, open_npz
 
 if TYPE_CHECKING:
     import pyarrow as pa
+    from pyarrow import parquet
 
 __all__ = ["MHR_VERTICES", "SAM3D_SUFFIXES", "Sam3dFrames", "read_sam3d"]
 
@@ -44,6 +45,9 @@ _SIZES = (0.2, 4.0)
 
 _TOP, _SOLE = 2809, 13069
 """A vertex on the top of the head, and one under a foot: which end of the body is up."""
+
+_SMALL, _MOST_EXPANSION = 256 * 2**20, 64
+"""Bytes that any file may unfold to, and times its size that a large one may."""
 
 _FIX = "Save one person with np.savez(path, **person), or frames of one person stacked."
 
@@ -138,10 +142,22 @@ def _read_parquet(path: Path) -> dict[str, np.ndarray]:
             names = file.schema_arrow.names
             if _VERTICES not in names:
                 raise _without_vertices(path, names)
+            _refuse_bomb(path, file.metadata)
             table = file.read(columns=[key for key in _LAYOUT if key in names])
     except (pa.ArrowException, OSError) as error:
         raise AssetError(path, cause=f"damaged ({error})", fix="Fetch or write it again.") from error
     return {key: _column(path, key, table.column(key).combine_chunks()) for key in table.column_names}
+
+
+def _refuse_bomb(path: Path, metadata: parquet.FileMetaData) -> None:
+    """Refuse a file of which more would be in memory than its size can mean."""
+    groups = (metadata.row_group(index) for index in range(metadata.num_row_groups))
+    chunks = (group.column(index) for group in groups for index in range(group.num_columns))
+    count = sum(chunk.num_values for chunk in chunks if chunk.path_in_schema.partition(".")[0] in _LAYOUT)
+    most = max(_SMALL, _MOST_EXPANSION * path.stat().st_size)
+    if 4 * count > most:
+        cause = f"unfolds to {4 * count} bytes, at most {most} are read of a file of {path.stat().st_size}"
+        raise AssetError(path, cause=cause, fix="Check where it comes from, or write it in parts.")
 
 
 def _column(path: Path, key: str, column: pa.Array) -> np.ndarray:

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from soma_core.errors import AssetError, InputError
+from soma_core.io import sam3d
 from soma_core.io.sam3d import MHR_VERTICES, read_sam3d
 
 FRAMES = 3
@@ -150,6 +151,12 @@ class TestParquet:
         rows = {key: list(value.reshape(2, -1)) for key, value in person.items()} | change
         with pytest.raises(InputError, match=f"p.parquet: .*{message}"):
             read_sam3d(save({key: value for key, value in rows.items() if value is not None}))
+
+    def test_what_unfolds_to_more_than_its_size_can_mean_is_refused(self, save, monkeypatch):
+        path = save({"pred_vertices": list(np.zeros((9, 3 * MHR_VERTICES), np.float32))})
+        monkeypatch.setattr(sam3d, "_SMALL", 0)
+        with pytest.raises(AssetError, match=r"p.parquet: unfolds to 1991412 bytes, at most \d+ are read"):
+            read_sam3d(path)
 
     def test_damage_is_said(self, save):
         path = save({"pred_vertices": [[0.0]]})
