@@ -200,8 +200,12 @@ def earlier_report(file: Path, result: Path, settings: Mapping[str, Any]) -> dic
     """
     if not (file.is_file() and result.is_file()):
         return None
-    report = _read_report(file)
-    before, now = dict(report["settings"]), json.loads(json.dumps(settings, default=str))
+    try:
+        report = _read_report(file)
+        before = dict(report["settings"])
+    except (ValueError, KeyError, TypeError):
+        return None  # no report of ours
+    now = json.loads(json.dumps(settings, default=str))
     before.pop("found", None)
     if before.pop("content", None) != now.pop("content"):
         return None  # the file was written anew

@@ -132,6 +132,9 @@ def test_what_was_fitted_before_is_left_alone(smplh_models, amass, amass_file, t
     assert str(again).endswith("mm (by an earlier run)")
     with pytest.raises(InputError, match=r"up: got '\+y', expected '\+z', as in the run that .*report\.json"):
         converted(amass_file, tmp_path / "out", up="y")
+    report = tmp_path / "out/report.json"
+    report.write_text(report.read_text()[:100])
+    assert not converted(amass_file, tmp_path / "out").earlier
     np.savez(amass_file, **amass | {"mocap_framerate": 30.0})
     anew = converted(amass_file, tmp_path / "out")
     assert (anew.earlier, anew.report["settings"]["fps"]) == (False, 30)
