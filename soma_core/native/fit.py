@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import Any
+from typing import Any, get_args
 
 import torch
 from torch import Tensor
@@ -37,7 +37,7 @@ _PER_FRAME = (
 )  # fmt: skip
 
 
-class NativeFit(torch.nn.Module):
+class NativeFit:
     """Recovers the pose parameters of a native model from posed SOMA bodies; keeps no state between calls.
 
     Canonical vertices go to the native topology, and the model's own pose is fitted to them: aligned
@@ -61,7 +61,7 @@ class NativeFit(torch.nn.Module):
         joint_names: of the model.
 
     Raises:
-        InputError: the backend does not tell its skinning.
+        InputError: the backend does not tell its skinning, or an option is out of range.
         BackendError: the backend is not usable.
     """
 
@@ -78,7 +78,12 @@ class NativeFit(torch.nn.Module):
         kernels: Kernels = "auto",
         registry: Registry | None = None,
     ) -> None:
-        super().__init__()
+        if kernels not in get_args(Kernels):
+            raise InputError(
+                "kernels", got=repr(kernels), expected="'auto', 'torch' or 'warp'", fix="Pass kernels='auto'."
+            )
+        if iterations < 0:
+            raise InputError("iterations", got=iterations, expected="at least 0", fix="Leave iterations out.")
         self.device, self.dtype = torch.device(device), dtype
         kind = {"device": self.device, "dtype": dtype}
         registry = registry or default_registry()
@@ -98,7 +103,7 @@ class NativeFit(torch.nn.Module):
         self.rig = NativeRig(self._model(self._one_body({})), self.scale, covered, kernels=kernels, **kind)
         self.joint_names = self.rig.joint_names
 
-    def forward(
+    def __call__(
         self,
         vertices: Tensor,
         *,
@@ -142,7 +147,7 @@ class NativeFit(torch.nn.Module):
         whole model. What the frames leave open stays at `start`.
 
         Args:
-            vertices, weights: as for :meth:`forward`.
+            vertices, weights: as for :meth:`__call__`.
             start: parameters to begin from; what is left out has its default.
             frames: how many frames, spread over the motion, to look at.
             iterations: largest number of steps.

@@ -105,9 +105,19 @@ def test_weights_leave_vertices_out(fit, vertices, motion):
     assert float(left) < float(before)
 
 
+def test_no_frames_are_none(fit, vertices):
+    found = fit(vertices[:0])
+    assert found.rotations.shape == (0, 55, 3)
+    assert found.vertex_error.shape == (0, fit.transfer.count)
+
+
 def test_refusals(fit, vertices):
     with pytest.raises(InputError, match=r"toy, whose generator has no skinning\(\)"):
         NativeFit("toy", registry=default_registry())
+    with pytest.raises(InputError, match="kernels: got 'cuda', expected 'auto', 'torch' or 'warp'"):
+        NativeFit("smplx", kernels="cuda")
+    with pytest.raises(InputError, match="iterations: got -1, expected at least 0"):
+        NativeFit("smplx", iterations=-1)
     with pytest.raises(InputError, match="params: got 2 bodies, expected one body for all frames"):
         fit(vertices, params={"betas": torch.zeros(2, 10)})
     with pytest.raises(InputError, match="frames: got 0, expected at least 1"):
