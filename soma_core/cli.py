@@ -56,7 +56,7 @@ TASKS = {
         module="invert", summary="find the pose of every frame of a moving mesh, errors in millimetres"
     ),
     "convert": TaskRow(
-        module="convert", summary="bring motions of AMASS, kimodo and other tools to this skeleton"
+        module="convert", summary="bring motions of AMASS, SAM 3D Body and kimodo to this skeleton, and back"
     ),
     "wrap": TaskRow(module="wrap", summary="lay the canonical mesh on any human mesh: an OBJ pair, a report"),
     "train-shape": TaskRow(
