@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
@@ -17,7 +17,6 @@ from soma_core.io.npz_fields import NpzFields, open_npz
 
 if TYPE_CHECKING:
     import pyarrow as pa
-    from pyarrow import parquet
 
 __all__ = ["MHR_VERTICES", "SAM3D_SUFFIXES", "Sam3dFrames", "read_sam3d"]
 
@@ -122,7 +121,7 @@ def _frames(fields: NpzFields, key: str) -> np.ndarray:
     array, shape = fields.raw(key), _LAYOUT[key]
     if array.dtype.kind != "f" or array.shape[-len(shape) :] != shape or array.ndim > len(shape) + 1:
         raise _another_layout(fields.path, key, f"shape {array.shape}, dtype {array.dtype}")
-    return array.reshape(-1, *shape).astype(np.float32)
+    return _single(array.reshape(-1, *shape))
 
 
 def _read_parquet(path: Path) -> dict[str, np.ndarray]:
@@ -139,24 +138,27 @@ def _read_parquet(path: Path) -> dict[str, np.ndarray]:
         ) from error
     try:
         with parquet.ParquetFile(path) as file:
-            names = file.schema_arrow.names
-            if _VERTICES not in names:
-                raise _without_vertices(path, names)
-            _refuse_bomb(path, file.metadata)
-            table = file.read(columns=[key for key in _LAYOUT if key in names])
-    except (pa.ArrowException, OSError) as error:
+            names, rows = file.schema_arrow.names, file.metadata.num_rows
+            wanted = [key for key in _LAYOUT if key in names]
+            _refuse_bomb(path, rows, wanted)
+            table = file.read(wanted, use_threads=False)
+        columns = {key: table.column(key).combine_chunks() for key in wanted}
+    except (pa.ArrowException, OSError, KeyError, UnicodeDecodeError) as error:
         raise AssetError(path, cause=f"damaged ({error})", fix="Fetch or write it again.") from error
-    return {key: _column(path, key, table.column(key).combine_chunks()) for key in table.column_names}
+    if _VERTICES not in names:
+        raise _without_vertices(path, names)
+    return {key: _column(path, key, column) for key, column in columns.items()}
 
 
-def _refuse_bomb(path: Path, metadata: parquet.FileMetaData) -> None:
-    """Refuse a file of which more would be in memory than its size can mean."""
-    groups = (metadata.row_group(index) for index in range(metadata.num_row_groups))
-    chunks = (group.column(index) for group in groups for index in range(group.num_columns))
-    count = sum(chunk.num_values for chunk in chunks if chunk.path_in_schema.partition(".")[0] in _LAYOUT)
+def _refuse_bomb(path: Path, rows: int, keys: Sequence[str]) -> None:
+    """Refuse a file that unfolds to more than its size can mean.
+
+    Rows are all that is asked for: pyarrow ends the process at a look at the columns of some damaged files.
+    """
+    unfolded = 4 * rows * sum(math.prod(_LAYOUT[key]) for key in keys)
     most = max(_SMALL, _MOST_EXPANSION * path.stat().st_size)
-    if 4 * count > most:
-        cause = f"unfolds to {4 * count} bytes, at most {most} are read of a file of {path.stat().st_size}"
+    if unfolded > most:
+        cause = f"unfolds to {unfolded} bytes, at most {most} are read of a file of {path.stat().st_size}"
         raise AssetError(path, cause=cause, fix="Check where it comes from, or write it in parts.")
 
 
@@ -180,7 +182,13 @@ def _column(path: Path, key: str, column: pa.Array) -> np.ndarray:
         ragged = "" if even else ", ragged"
         got = f"{len(column)} rows of {column.type} with {len(values)} numbers and {nulls} nulls{ragged}"
         raise _another_layout(path, key, got)
-    return values.to_numpy(zero_copy_only=False).reshape(-1, *_LAYOUT[key]).astype(np.float32)
+    return _single(values.to_numpy(zero_copy_only=False).reshape(-1, *_LAYOUT[key]))
+
+
+def _single(values: np.ndarray) -> np.ndarray:
+    """Values as float32; those beyond it become infinite, and are refused as such."""
+    with np.errstate(over="ignore"):
+        return values.astype(np.float32)
 
 
 def _without_vertices(path: Path, names: object) -> InputError:

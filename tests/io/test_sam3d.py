@@ -117,7 +117,8 @@ class TestParquet:
         from pyarrow import parquet
 
         def save(columns: dict[str, object]) -> Path:
-            parquet.write_table(pa.table(columns), tmp_path / "p.parquet")
+            table = columns if isinstance(columns, pa.Table) else pa.table(columns)
+            parquet.write_table(table, tmp_path / "p.parquet")
             return tmp_path / "p.parquet"
 
         return save
@@ -156,6 +157,13 @@ class TestParquet:
         path = save({"pred_vertices": list(np.zeros((9, 3 * MHR_VERTICES), np.float32))})
         monkeypatch.setattr(sam3d, "_SMALL", 0)
         with pytest.raises(AssetError, match=r"p.parquet: unfolds to 1991412 bytes, at most \d+ are read"):
+            read_sam3d(path)
+
+    def test_a_key_twice_is_refused(self, save):
+        pa = pytest.importorskip("pyarrow")
+        column = pa.array([[0.0]])
+        path = save(pa.Table.from_arrays([column, column], ["pred_vertices", "pred_vertices"]))
+        with pytest.raises(AssetError, match="p.parquet: damaged"):
             read_sam3d(path)
 
     def test_damage_is_said(self, save):
