@@ -11,7 +11,6 @@ from torch import Tensor
 
 from soma_core.correctives.features import PoseFeatures
 from soma_core.correctives.weights import (
-    CHECKPOINT_NAME,
     CorrectiveWeights,
     check_bind_pose,
     read_weights,
@@ -19,11 +18,12 @@ from soma_core.correctives.weights import (
 from soma_core.errors import AssetError
 from soma_core.geometry.sparse import SparseRows
 from soma_core.paths import assets_dir
+from soma_core.rig.manifest import CORRECTIVES_NAME
 from soma_core.rig.mesh import CanonicalMesh
 from soma_core.rig.skeleton import Rig
 from soma_core.topology.lod_transfer import offset_rows
 
-__all__ = ["Correctives", "find_correctives", "load_correctives"]
+__all__ = ["Correctives", "find_correctives", "load_correctives", "skeleton_length"]
 
 
 class Correctives(torch.nn.Module):
@@ -55,17 +55,12 @@ class Correctives(torch.nn.Module):
         used = np.flatnonzero(np.diff(second.indptr))  # activations that move anything
         self.first = SparseRows(weights.first.T.tocsr()[used], dtype=dtype, device=device)
         self.second = SparseRows(second[:, used].tocsr(), dtype=dtype, device=device)
-        self._parents = [int(parent) for parent in rig.parents[2:]]
-        places = torch.as_tensor(rig.bind_world[None, :, :3, 3].copy())
-        self.length = float(self._skeleton_length(places))
-
-    def _skeleton_length(self, places: Tensor) -> Tensor:
-        """Sum of all bones below the Hips, (B,) [m], of joint places (B, J, 3)."""
-        return (places[:, 2:] - places[:, self._parents]).norm(dim=-1).sum(1)
+        self._rig = rig
+        self.length = float(skeleton_length(torch.as_tensor(rig.bind_world.copy())[None], rig))
 
     def scale(self, bind_world: Tensor) -> Tensor:
         """How large bodies are beside the canonical one, (B,), by the length of their bones."""
-        return self._skeleton_length(bind_world[..., :3, 3]) / self.length
+        return skeleton_length(bind_world, self._rig) / self.length
 
     def forward(self, relative: Tensor, bind_world: Tensor) -> Tensor:
         """Offsets (B, v, 3) [m] of rest shapes in the bind pose. Differentiable.
@@ -83,6 +78,12 @@ class Correctives(torch.nn.Module):
         return moved.view(-1, 3, len(features)).permute(2, 0, 1)
 
 
+def skeleton_length(bind_world: Tensor, rig: Rig) -> Tensor:
+    """Sum of all bones below the Hips [m], (B,), of bind transforms (B, J, 4, 4)."""
+    places = bind_world[..., :3, 3]
+    return (places[:, 2:] - places[:, rig.parents[2:].tolist()]).norm(dim=-1).sum(1)
+
+
 def find_correctives(given: Path | str | None, *, shipped: bool) -> Path | None:
     """The checkpoint that is used; None for none.
 
@@ -95,7 +96,7 @@ def find_correctives(given: Path | str | None, *, shipped: bool) -> Path | None:
     """
     if given is None or (given == "auto" and not shipped):
         return None
-    path = assets_dir() / CHECKPOINT_NAME if given == "auto" else Path(given)
+    path = assets_dir() / CORRECTIVES_NAME if given == "auto" else Path(given)
     if path.is_file():
         return path
     if given == "auto":

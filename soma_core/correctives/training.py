@@ -13,12 +13,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from soma_core.cache import atomic_write
 from soma_core.correctives.data import Batch, LessonStore
 from soma_core.correctives.network import CorrectivesNetwork
 from soma_core.correctives.processes import Processes
 from soma_core.correctives.second_stage import accumulate, all_entries, solve
 from soma_core.correctives.teacher import Clip
+from soma_core.correctives.weights import write_tensors
 from soma_core.errors import InputError
 
 __all__ = ["MOVED", "Epoch", "Progress", "Trainer", "TrainingOptions", "reduction"]
@@ -267,7 +267,7 @@ class Trainer:
             "best": self._best,
             "optimiser": self._optimiser.state_dict(),
         }
-        atomic_write(path, lambda temporary: torch.save(content, temporary))
+        write_tensors(path, content)
 
     def _restore(self, path: Path, key: str) -> bool:
         if not path.is_file():

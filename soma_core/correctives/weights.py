@@ -20,9 +20,13 @@ from soma_core.errors import AssetError
 from soma_core.files import refuse_unreadable
 from soma_core.rig.skeleton import Rig
 
-__all__ = ["CHECKPOINT_NAME", "CorrectiveWeights", "check_bind_pose", "read_weights", "write_weights"]
-
-CHECKPOINT_NAME = "correctives_model.pt"
+__all__ = [
+    "CorrectiveWeights",
+    "check_bind_pose",
+    "read_weights",
+    "write_tensors",
+    "write_weights",
+]
 
 _METRES = {"centimeters": 0.01, "cm": 0.01, "meters": 1.0, "m": 1.0, "millimeters": 0.001, "mm": 0.001}
 _KEYS = ("C_max", "use_tanh", "bindpose", "W1", "W2", "M1_mask", "M2_mask", "meta")
@@ -84,7 +88,17 @@ def write_weights(path: Path, weights: CorrectiveWeights) -> None:
         "unit": "centimeters",
         "meta": dict(weights.meta),
     }  # fmt: skip
-    atomic_write(Path(path), lambda temporary: torch.save(content, temporary))
+    write_tensors(Path(path), content)
+
+
+def write_tensors(path: Path, content: Mapping[str, Any]) -> None:
+    """Write what ``torch.load(weights_only=True)`` reads, atomically and under any name."""
+
+    def write(temporary: Path) -> None:
+        with open(temporary, "wb") as stream:  # torch itself refuses names without a suffix
+            torch.save(dict(content), stream)
+
+    atomic_write(path, write)
 
 
 def _stored(matrix: scipy.sparse.csr_array) -> Tensor:

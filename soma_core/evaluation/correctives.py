@@ -175,7 +175,8 @@ def _bodies(subject: _Subject, motion: np.ndarray) -> tuple[list[list[str | floa
     """The same correctives on other bodies: error to a teacher of their own, and pictures of one pose."""
     rows: list[list[str | float | None]] = []
     shown = []
-    frame = motion[len(motion) * 3 // 4][None]
+    turned = ((motion - np.eye(3)) ** 2)[:, 1:].sum((1, 2, 3))
+    frame = motion[int(turned.argmax())][None]  # the one that bends most
     for backend, label, params in _BODIES:
         layer = SomaLayer(backend, dtype=torch.float64, correctives=None)
         identity = layer.identity(params)

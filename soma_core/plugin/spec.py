@@ -19,6 +19,7 @@ __all__ = [
     "Generator",
     "HasLinearBasis",
     "HasPosed",
+    "HasRandomPoses",
     "HasSkinning",
     "HasTriangles",
     "LinearBasis",
@@ -195,6 +196,15 @@ class SkinnedModel:
     joints: Tensor
     weights: Tensor
     pose_offsets: Callable[[Tensor], Tensor] | None = None
+
+
+@runtime_checkable
+class HasRandomPoses(Protocol):
+    """Optional capability beside ``posed()``: poses of the native model to learn correctives from."""
+
+    def random_poses(self, count: int, seed: int) -> Any:
+        """`count` poses that a person could take, in the form that ``posed()`` takes; the root at rest."""
+        ...
 
 
 @runtime_checkable

@@ -16,7 +16,14 @@ from soma_core.cache import atomic_write, file_sha256
 from soma_core.errors import AssetError
 from soma_core.rig.compression import compress_shape_space
 from soma_core.rig.expansion import helper_transforms
-from soma_core.rig.manifest import NEUTRAL_NAME, PROCEDURAL_NAME, RIG_NAME, Manifest, write_manifest
+from soma_core.rig.manifest import (
+    CORRECTIVES_NAME,
+    NEUTRAL_NAME,
+    PROCEDURAL_NAME,
+    RIG_NAME,
+    Manifest,
+    write_manifest,
+)
 from soma_core.rig.neutral import SEGMENT_NAMES, ShapeSpace, load_shape_space, write_neutral
 from soma_core.rig.procedural import ProceduralDefinition
 from soma_core.rig.procedural_json import parse_procedural
@@ -265,9 +272,12 @@ def _entry(path: Path, counts: Mapping[str, int], built: _Built, unit: str, orig
     }
 
 
-def _motion_entries(output: Path, built: _Built) -> dict[str, dict[str, Any]]:
-    """Motions that lie in the folder already: made by the project, listed and checked like the rest."""
+def _found_entries(output: Path, built: _Built) -> dict[str, dict[str, Any]]:
+    """Motions and correctives that lie in the folder already: made by the project, listed like the rest."""
     entries = {}
+    checkpoint = output / CORRECTIVES_NAME
+    if checkpoint.is_file():
+        entries[CORRECTIVES_NAME] = _entry(checkpoint, {}, built, "cm", "trained by this project")
     for path in sorted((output / "motions").glob("*.npz")):
         with np.load(path, allow_pickle=False) as file:
             counts = {"frames": len(file["poses"])} if "poses" in file.files else {}
@@ -316,7 +326,7 @@ def build_assets(output: Path, shape_space: Path | None = None) -> Manifest:
         NEUTRAL_NAME: _entry(
             output / NEUTRAL_NAME, {**counts, "components": space.component_count}, built, "cm", _ORIGIN
         ),
-        **_motion_entries(output, built),
+        **_found_entries(output, built),
     }
     manifest = Manifest(rig_hash=built.rig_hash, rig_revision=_revision(built), files=files)
     write_manifest(output, manifest)

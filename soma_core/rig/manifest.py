@@ -13,6 +13,7 @@ from soma_core.errors import AssetError
 from soma_core.files import refuse_unreadable
 
 __all__ = [
+    "CORRECTIVES_NAME",
     "MANIFEST_NAME",
     "NEUTRAL_NAME",
     "PROCEDURAL_NAME",
@@ -27,6 +28,7 @@ __all__ = [
 MANIFEST_NAME = "MANIFEST.json"
 RIG_NAME = "SOMA_template_rig.usda"
 NEUTRAL_NAME = "SOMA_neutral.npz"
+CORRECTIVES_NAME = "correctives_model.pt"
 PROCEDURAL_NAME = "SOMA_procedural_transforms.json"
 
 _SCHEMA = 1

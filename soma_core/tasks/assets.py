@@ -10,6 +10,7 @@ from soma_core.cache import atomic_write
 from soma_core.errors import AssetError
 from soma_core.paths import assets_dir
 from soma_core.rig.manifest import (
+    CORRECTIVES_NAME,
     MANIFEST_NAME,
     NEUTRAL_NAME,
     PROCEDURAL_NAME,
@@ -40,9 +41,9 @@ def build_assets(output: Path, shape_space: Path | None = None) -> None:
 
     root, trained = Path(output), None if shape_space is None else Path(shape_space)
     manifest = build(root, trained)
-    if not (root / _CLIP).is_file():
-        _add_clip(root)
-        manifest = build(root)  # lists the clip; what is there already comes out the same
+    added = [add(root) for add in (_add_clip, _add_correctives)]
+    if any(added):
+        manifest = build(root)  # lists what was added; what is there already comes out the same
     if not load_shape_space(root / NEUTRAL_NAME).eigenvalues.size:
         _log.warning(
             "%s holds no shape components: run soma train-shape, then soma assets build --shape-space FILE",
@@ -51,17 +52,32 @@ def build_assets(output: Path, shape_space: Path | None = None) -> None:
     _log.info("assets of rig %s are in %s", manifest.rig_revision, root)
 
 
-def _add_clip(root: Path) -> None:
+def _add_shipped(root: Path, name: Path | str) -> bool:
+    """Copy a shipped file that the folder lacks; False where there is nothing to do or to copy."""
+    shipped = assets_dir() / name
+    if (root / name).is_file() or not shipped.is_file():
+        return False
+    atomic_write(root / name, lambda target: shutil.copyfile(shipped, target))
+    return True
+
+
+def _add_correctives(root: Path) -> bool:
+    """Put the trained correctives into a folder; the layer checks that they belong to its rig."""
+    return _add_shipped(root, CORRECTIVES_NAME)
+
+
+def _add_clip(root: Path) -> bool:
     """Put the clip into an assets folder: the shipped one, else a new one for the rig in that folder."""
-    shipped = assets_dir() / _CLIP
-    if shipped.is_file():
-        atomic_write(root / _CLIP, lambda target: shutil.copyfile(shipped, target))
-        return
+    if (root / _CLIP).is_file():
+        return False
+    if _add_shipped(root, _CLIP):
+        return True
     from soma_core.io.motion_files import write_motion
     from soma_core.rig.canonical import load_canonical
     from soma_core.tasks.range_of_motion import range_of_motion
 
     write_motion(range_of_motion(load_canonical(root=root)[1]), root / _CLIP, rotation_repr="rotvec")
+    return True
 
 
 def _unlisted(root: Path, listed: set[str]) -> list[str]:
@@ -85,12 +101,23 @@ def _contents(root: Path) -> list[str]:
         lambda: load_canonical("low", root),
         lambda: load_canonical("xlo", root),
         lambda: load_shape_space(root / NEUTRAL_NAME),
+        lambda: _correctives(root),
     ):
         try:
             check()
         except AssetError as error:
             findings.append(str(error))
     return findings
+
+
+def _correctives(root: Path) -> None:
+    """Open the correctives, where there are any, and compare them with the rig."""
+    from soma_core.correctives.weights import check_bind_pose, read_weights
+    from soma_core.rig.canonical import load_canonical
+
+    path = root / CORRECTIVES_NAME
+    if path.is_file():
+        check_bind_pose(path, read_weights(path), load_canonical("mid", root)[1])
 
 
 def verify_assets(root: Path | None = None) -> list[str]:

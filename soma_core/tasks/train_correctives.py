@@ -23,12 +23,13 @@ from soma_core.correctives.plot import plot_history
 from soma_core.correctives.processes import Processes, joined_processes
 from soma_core.correctives.teacher import Clip, ElasticTeacher, Teacher
 from soma_core.correctives.training import Trainer, TrainingOptions, reduction
-from soma_core.correctives.weights import CHECKPOINT_NAME, CorrectiveWeights, read_weights, write_weights
+from soma_core.correctives.weights import CorrectiveWeights, read_weights, write_weights
 from soma_core.errors import InputError
 from soma_core.io import read_motion
 from soma_core.paths import cache_dir
 from soma_core.progress import progress
 from soma_core.rig import load_canonical
+from soma_core.rig.manifest import CORRECTIVES_NAME
 from soma_core.rig.mesh import CanonicalMesh
 from soma_core.rig.skeleton import Rig
 from soma_core.topology.lod_transfer import offset_rows
@@ -69,7 +70,7 @@ def run(config: DictConfig, output: Path) -> None:
             network, masks, store, clips["train"], rig, ridge=options.ridge, budget=budget,
             mirror=options.mirror, meta={**meta, "epochs": len(trainer.history)},
         )  # fmt: skip
-        path = Path(config.out) if config.out else output / CHECKPOINT_NAME
+        path = Path(config.out) if config.out else output / CORRECTIVES_NAME
         write_weights(path, weights)
         measured = _tested(read_weights(path), store, clips["test"], mesh, rig)
         _report(output, {**meta, **measured, "bytes": path.stat().st_size, "history": trainer.history})

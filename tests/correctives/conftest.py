@@ -51,12 +51,17 @@ class KnownTeacher:
         return Lesson(rotations=clip.rotations, offsets=self.network(features).numpy() / 100)
 
 
-@pytest.fixture(scope="session")
-def body() -> Body:
+def made_body() -> Body:
+    """The synthetic body and its masks."""
     mesh, rig = tiny_canonical()
     creases = find_creases(rig)
     masks = Masks(joints=joint_mask(rig, creases), vertices=vertex_mask(mesh, rig, creases))
     return Body(mesh=mesh, rig=rig, creases=creases, masks=masks)
+
+
+@pytest.fixture(scope="session")
+def body() -> Body:
+    return made_body()
 
 
 @pytest.fixture

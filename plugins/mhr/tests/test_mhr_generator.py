@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 from soma_backend_mhr._files import LOD6
-from soma_backend_mhr._generator import MhrGenerator
+from soma_backend_mhr._generator import POSE, MhrGenerator
 from soma_backend_mhr._model_file import load_model
 
 from soma_core.errors import InputError
@@ -87,3 +87,13 @@ def test_other_poses_are_refused(model, pose, got):
     params, _ = split(random(3, 45), random(3, 204))
     with pytest.raises(InputError, match=f"pose: .*{got}"):
         model.posed(params, pose)
+
+
+def test_random_poses_are_the_seed_s_own_and_keep_the_root():
+    generator = MhrGenerator(None, CPU)
+    first, again, other = (generator.random_poses(20, seed)["parameters"] for seed in (1, 1, 2))
+    assert first.shape == (20, POSE)
+    assert torch.equal(first, again)
+    assert not torch.equal(first, other)
+    assert not first[:, :6].any()
+    assert first.abs().max() <= 1.6

@@ -1,0 +1,113 @@
+"""Clips and lessons: reproducible, split by clip, cached, mirrored, streamed."""
+
+import numpy as np
+import pytest
+import torch
+
+from soma_core.correctives.data import SPLITS, ClipPlan, LessonStore, plan_clips, split_clips
+from soma_core.correctives.poses import mirror_rotations, random_rotations
+from soma_core.errors import InputError
+from soma_core.geometry.rotations import axis_angle_to_matrix, orthonormality_error
+
+HALF = 1e-3  # relative rounding of offsets in half precision
+
+
+def _plan(**changes):
+    return ClipPlan(**{"random_clips": 5, "poses": 4, "motions": {}, "seed": 3, **changes})
+
+
+@pytest.fixture
+def store(body, teacher, tmp_path):
+    return LessonStore(tmp_path, teacher, body.mesh, body.rig)
+
+
+@pytest.fixture
+def clips(body):
+    return plan_clips(_plan(), body.rig.user_joint_names)
+
+
+def test_random_poses_are_rotations_within_human_limits(body):
+    names = body.rig.user_joint_names
+    found = random_rotations(names, 200, np.random.default_rng(0))
+    assert orthonormality_error(torch.as_tensor(found)).max() < 1e-12
+    bend = np.degrees(np.arccos(np.clip((np.trace(found, axis1=2, axis2=3) - 1) / 2, -1, 1)))
+    largest = dict(zip(names, bend.max(0), strict=True))
+    assert largest["HeadEnd"] == 0
+    assert 100 < largest["LeftShin"] < 160
+    assert largest["Chest"] < 45
+    knee = found[:, names.index("LeftShin")]
+    assert np.arctan2(knee[:, 2, 1], knee[:, 1, 1]).min() > np.radians(-10)  # knees do not bend forward
+
+
+def test_mirror_images(body):
+    names = body.rig.user_joint_names
+    rotations = random_rotations(names, 3, np.random.default_rng(1))
+    mirrored = mirror_rotations(rotations, names)
+    np.testing.assert_allclose(mirror_rotations(mirrored, names), rotations)
+    raised = axis_angle_to_matrix(torch.tensor([0.0, 0.0, 1.0])).double().numpy()
+    pose = np.tile(np.eye(3), (len(names), 1, 1))
+    pose[names.index("LeftArm")] = raised
+    image = mirror_rotations(pose, names)
+    np.testing.assert_allclose(image[names.index("RightArm")], raised.T, atol=1e-12)
+    np.testing.assert_allclose(image[names.index("LeftArm")], np.eye(3), atol=1e-12)
+
+
+def test_a_clip_depends_on_its_number_alone(body, clips):
+    more = plan_clips(_plan(random_clips=8), body.rig.user_joint_names)
+    for clip, again in zip(clips, more, strict=False):
+        assert clip.name == again.name
+        np.testing.assert_array_equal(clip.rotations, again.rotations)
+    other = plan_clips(_plan(seed=4), body.rig.user_joint_names)
+    assert np.abs(other[0].rotations - clips[0].rotations).max() > 0.1
+
+
+def test_splits_share_no_clip(body):
+    motion = random_rotations(body.rig.user_joint_names, 6, np.random.default_rng(2))
+    clips = plan_clips(_plan(random_clips=20, motions={"walk": motion}), body.rig.user_joint_names)
+    split = split_clips(clips, held_out=0.1, seed=0)
+    assert [len(split[name]) for name in SPLITS] == [17, 2, 2]
+    assert sorted(clip.name for part in split.values() for clip in part) == sorted(
+        clip.name for clip in clips
+    )
+    assert split == split_clips(clips, held_out=0.1, seed=0)
+
+
+def test_too_few_clips_are_named(body):
+    with pytest.raises(InputError, match=r"data: got 2 clips, expected at least 3"):
+        plan_clips(_plan(random_clips=2), body.rig.user_joint_names)
+
+
+def test_lessons_are_taught_once(store, teacher, clips):
+    assert store.missing(clips) == clips
+    store.teach(clips[0])
+    assert store.missing(clips) == clips[1:]
+    assert teacher.taught == [clips[0].name]
+    ids = np.array([4, 2, 9])
+    wanted = teacher.teach(clips[0])
+    batch = store.read(clips[0], ids)
+    np.testing.assert_allclose(batch.offsets, wanted.offsets[:, ids], rtol=HALF, atol=1e-6)
+    features = teacher.features(torch.as_tensor(clips[0].rotations).float())
+    torch.testing.assert_close(batch.features, features)
+
+
+def test_mirrored_lessons_are_those_of_the_partners(store, body, clips):
+    store.teach(clips[0])
+    everywhere = np.arange(body.mesh.vertex_count)
+    plain, both = store.read(clips[0], everywhere), store.read(clips[0], everywhere, mirrored=True)
+    count = len(clips[0].rotations)
+    torch.testing.assert_close(both.offsets[:count], plain.offsets)
+    image = plain.offsets[:, body.mesh.mirror] * torch.tensor([-1.0, 1, 1])
+    torch.testing.assert_close(both.offsets[count:], image)
+
+
+def test_every_pose_is_streamed_at_most_once(store, clips):
+    for clip in clips:
+        store.teach(clip)
+    ids = np.arange(3)
+    batches = list(store.batches(clips, 3, np.random.default_rng(0), ids, pool=2))
+    assert len(batches) == 20 // 3
+    assert {len(batch.features) for batch in batches} == {3}
+    seen = torch.cat([batch.features.flatten(1) for batch in batches])
+    assert len(torch.unique(seen, dim=0)) == len(seen)
+    again = list(store.batches(clips, 3, np.random.default_rng(0), ids, pool=2))
+    torch.testing.assert_close(again[0].features, batches[0].features)
