@@ -17,6 +17,7 @@ from soma_core.cli import EXIT_BACKEND, EXIT_FAILED, EXIT_OK, EXIT_PIPE, EXIT_US
 from soma_core.errors import AssetError, SomaError
 from soma_core.paths import assets_dir, configs_dir
 from soma_core.plugin.errors import BackendWarning
+from soma_core.plugin.known import KNOWN_BACKENDS
 from tests.plugin.installed import Distribution
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -98,9 +99,10 @@ def test_the_worst_job_of_a_sweep_sets_the_exit_code(tmp_path: Path, monkeypatch
 
 def test_a_backend_that_is_not_usable_has_its_own_exit_code(tmp_path: Path, monkeypatch, capsys) -> None:
     monkeypatch.chdir(tmp_path)
-    assert main(["backends", "show", "mhr"]) == EXIT_BACKEND
-    assert main(["animate", "backend=mhr"]) == EXIT_BACKEND
-    assert capsys.readouterr().err.count("Run: pip install soma-backend-mhr") == 2
+    monkeypatch.setitem(KNOWN_BACKENDS, "absent", "soma-backend-absent")
+    assert main(["backends", "show", "absent"]) == EXIT_BACKEND
+    assert main(["animate", "backend=absent"]) == EXIT_BACKEND
+    assert capsys.readouterr().err.count("Run: pip install soma-backend-absent") == 2
 
 
 def test_strict_lets_the_traceback_through(monkeypatch) -> None:

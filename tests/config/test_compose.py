@@ -14,6 +14,7 @@ from omegaconf import DictConfig
 from soma_core.config.compose import run_task
 from soma_core.errors import InputError, SomaError
 from soma_core.plugin.errors import UnknownBackendError
+from soma_core.plugin.known import KNOWN_BACKENDS
 
 Run = Callable[..., list[Path | SomaError]]
 
@@ -126,8 +127,11 @@ def test_a_wrong_override_is_named_in_full(run: Run, override: str, text: str, t
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_backend_that_is_not_installed_is_reported_in_our_words(run: Run) -> None:
-    with pytest.raises(UnknownBackendError, match='"mhr".*Run: pip install soma-backend-mhr'):
-        run("backend=mhr")
-    with pytest.raises(UnknownBackendError, match='"mhr"'):
-        run("--multirun", "backend=soma,mhr")
+def test_a_backend_that_is_not_installed_is_reported_in_our_words(
+    run: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(KNOWN_BACKENDS, "absent", "soma-backend-absent")
+    with pytest.raises(UnknownBackendError, match='"absent".*Run: pip install soma-backend-absent'):
+        run("backend=absent")
+    with pytest.raises(UnknownBackendError, match='"absent"'):
+        run("--multirun", "backend=soma,absent")
