@@ -28,20 +28,24 @@ class BlendMoments:
 
     Args:
         shapes: (9 J, n, 3) from :func:`blend_shapes`.
-        moments: of its rig.
+        moments: of the rig.
         rest: of the body under `weights`.
         weights: (n,) of the vertices.
+        above: (n_variables, T), 1 where a variable joint is a weighted one or lies above it.
     """
 
-    def __init__(self, shapes: Tensor, moments: SkinMoments, rest: RestMoments, weights: Tensor) -> None:
+    def __init__(
+        self, shapes: Tensor, moments: SkinMoments, rest: RestMoments, weights: Tensor, above: Tensor
+    ) -> None:
         flat = (shapes * weights.sqrt()[:, None]).flatten(1)
         self._own = (flat @ flat.T).unflatten(0, (-1, 9)).unflatten(2, (-1, 9))  # (J, 9, J, 9)
-        point = torch.cat((rest.local[0], torch.ones_like(rest.local[0, :, :1])), 1) * rest.weight[0, :, None]
-        starts, cross = moments.joint_start.tolist(), []
-        for first, last in pairwise(starts):
-            moved = shapes[:, moments.influence_vertex[first:last]].transpose(0, 1).flatten(1)
-            cross.append((point[first:last].T @ moved).view(4, -1, 9, 3))
-        self._cross = torch.stack(cross)  # (T, 4, J, 9, 3)
+        self._above, pulls = above, []
+        for first, last in pairwise(moments.joint_start.tolist()):
+            moved = shapes[:, moments.influence_vertex[first:last]] * rest.weight[0, first:last, None]
+            torque = torch.einsum("mec,edc->md", moved, skew(rest.local[0, first:last]))
+            pulls.append(torch.stack((torque, moved.sum(1)), -1))
+        # Torque about each joint and force on it, in the joint's own axes: (J, 9, T, 3, 2).
+        self._pull = torch.stack(pulls, 1).unflatten(0, (-1, 9))
 
     def matrix(self, relative: Tensor, turns: Tensor, places: Tensor, solver: GaussNewton) -> Tensor:
         """What to add to the matrix (F, n + 1, 3, n + 1, 3) of :meth:`GaussNewton.normal_equations`.
@@ -51,21 +55,24 @@ class BlendMoments:
             turns, places: world turns and places of the joints, (F, J + 1, 3, 3) and (F, J + 1, 3).
             solver: whose variables the matrix has.
         """
-        n, count = solver.variables, len(solver.variables)
+        n, count, frames = solver.variables, len(solver.variables), len(turns)
         axes = turns[:, solver.parents[n]]  # row a: the world's axis a in the axes of the parent
         change = (skew(axes) @ relative[:, n, None]).flatten(3)  # (F, n, 3, 9)
         by_joint = change.permute(1, 0, 2, 3).flatten(1, 2)  # (n, 3 F, 9)
         own = by_joint @ self._own[n - 1][:, :, n - 1].flatten(2)
         own = own.unflatten(1, (-1, 3)).unflatten(3, (count, 9)).permute(1, 3, 0, 2, 4)
         own = (own.flatten(2, 3) @ change.transpose(-1, -2)).unflatten(2, (count, 3))
-        moved = by_joint @ self._cross[:, :, n - 1].permute(2, 3, 0, 1, 4).flatten(2)
-        moved = moved.view(count, -1, 3, *self._cross.shape[:2], 3).permute(1, 0, 2, 3, 5, 4)
-        forces = turns[:, None, None, solver.joints] @ moved  # (F, n, 3, T, 3, 4)
-        each = [one[:, None].expand(-1, 3 * count, *one.shape[1:]).flatten(0, 1) for one in (turns, places)]
-        cross = solver.slopes(*each, forces.flatten(0, 2)).view(-1, count, 3, count + 1, 3)
+        pull = (by_joint @ self._pull[n - 1].flatten(2)).view(count, frames, 3, -1, 3, 2)
+        pull = turns[:, solver.joints] @ pull.permute(1, 3, 4, 0, 2, 5).flatten(3)  # (F, T, 3, n 3 2)
+        torque, force = pull.unflatten(3, (-1, 2)).unbind(-1)  # of each weighted joint, (F, T, 3, 3 n)
+        torque = torque + skew(places[:, solver.joints]) @ force
+        torque, force = ((self._above @ one.flatten(2)).view(frames, count, 3, -1) for one in (torque, force))
+        torque = torque - skew(places[:, n]) @ force  # of each subtree about its joint
+        total = pull.unflatten(3, (-1, 2))[..., 1].sum(1, keepdim=True)
+        cross = torch.cat((torque, total), 1).unflatten(3, (count, 3))  # (F, n + 1, 3, n, 3)
         matrix = torch.nn.functional.pad(own.permute(0, 2, 3, 1, 4), (0, 0, 0, 1, 0, 0, 0, 1))
-        matrix[:, :count] += cross
-        matrix[:, :, :, :count] += cross.permute(0, 3, 4, 1, 2)
+        matrix[:, :, :, :count] += cross
+        matrix[:, :count] += cross.permute(0, 3, 4, 1, 2)
         return matrix
 
 

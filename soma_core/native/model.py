@@ -73,6 +73,7 @@ class NativeRig(torch.nn.Module):
     Attributes:
         joint_names: of the model's joints.
         blended: whether poses add to the rest mesh before it is skinned.
+        above: (n, T), 1 where a variable joint is a weighted one or lies above it.
         animation, moments, solver, start: of the rig.
     """
 
@@ -96,6 +97,8 @@ class NativeRig(torch.nn.Module):
         self.animation = Animation(rig, kernels=kernels, **kind)
         self.moments = SkinMoments(structure, rig, warp=warp, **kind)
         self.solver = GaussNewton(structure, warp=warp, **kind)
+        above = structure.ancestors[structure.variables][:, structure.joints]
+        self.register_buffer("above", torch.as_tensor(above, device=device).to(dtype), persistent=False)
         self.start = ProcrustesStart(structure, **kind)
 
     def bodies(self, rest: Tensor, joints: Tensor) -> Identity:

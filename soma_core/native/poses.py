@@ -18,6 +18,9 @@ __all__ = ["PoseFit"]
 _SKIN_ITERATIONS = 40
 """Largest number of steps before blend shapes come in; they cost next to nothing."""
 
+_BURST = 4
+"""Steps under the whole model after which frames that have converged are left alone: most have by then."""
+
 
 class PoseFit:
     """Fits poses of one body.
@@ -53,18 +56,27 @@ class PoseFit:
         self.rest = rig.moments.rest(body.identity, weights[None], offsets)
         self.blend = blend
         if rig.blended and iterations and blend is None:
-            self.blend = BlendMoments(rig.blend_shapes, rig.moments, self.rest, weights)
+            self.blend = BlendMoments(rig.blend_shapes, rig.moments, self.rest, weights, rig.above)
 
     def __call__(self, target: Tensor) -> Pose:
         """Poses for finite targets (F, n, 3) [m]; translations are places of the root joint."""
         pose = self._skinned(target)
         if self.blend is None:
             return pose
-        whole = Refinement(
-            rig=self.rig, body=self.body, rest=self.rest, blend=self.blend, target=target,
-            weights=self.weights,
-        )  # fmt: skip
-        return whole(pose, iterations=self._iterations, tolerance=self._tolerance)
+        pose = replace(pose, accepted=torch.zeros_like(pose.accepted))
+        rows = torch.arange(len(target), device=target.device)
+        for done in range(0, self._iterations, _BURST):
+            if not len(rows):
+                break
+            whole = Refinement(
+                rig=self.rig, body=self.body, rest=self.rest, blend=self.blend, target=target[rows],
+                weights=self.weights,
+            )  # fmt: skip
+            steps = min(_BURST, self._iterations - done)
+            part = whole(_rows(pose, rows), iterations=steps, tolerance=self._tolerance)
+            pose = _put(pose, rows, part)
+            rows = rows[part.last_change >= self._tolerance]
+        return pose
 
     def matrix(self, pose: Pose, turns: Tensor, places: Tensor) -> Tensor:
         """Gauss-Newton matrix (F, n + 1, 3, n + 1, 3) of the whole model at poses with these joints."""
@@ -89,3 +101,12 @@ class PoseFit:
         pose = replace(pose, translation=shift)
         pose = rig.solver(moments, rest, pose, iterations=_SKIN_ITERATIONS, tolerance=self._tolerance)
         return replace(pose, translation=pose.translation + origin)
+
+
+def _rows(pose: Pose, rows: Tensor) -> Pose:
+    return Pose(**{name: value[rows] for name, value in vars(pose).items()})
+
+
+def _put(pose: Pose, rows: Tensor, part: Pose) -> Pose:
+    old = vars(pose)
+    return Pose(**{name: old[name].index_copy(0, rows, value) for name, value in vars(part).items()})

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -51,8 +51,7 @@ class Refinement:
             tolerance: a frame rests once a step changed its energy by less, as a root mean square [m].
         """
         mass = self.weights.sum()
-        pose = replace(start, accepted=torch.zeros_like(start.accepted))
-        view = self._view(pose)
+        pose, view = start, self._view(start)
         damping = torch.full_like(start.last_change, _START_DAMPING)
         raising = torch.full_like(damping, _RAISE)
         moving = torch.ones_like(start.accepted, dtype=torch.bool)

@@ -33,7 +33,7 @@ def test_matrix_of_rigid_parts_is_that_of_the_derivatives():
     eye = torch.eye(3).to(pelvis).expand(1, 1, 3, 3)
     pose = Pose.begin(torch.cat((eye, axis_angle_to_matrix(rotations)), 1), pelvis)
     turns, places = rig.solver.walk(pose, fit.rest.offsets)
-    blend = BlendMoments(rig.blend_shapes, rig.moments, fit.rest, fit.weights)
+    blend = BlendMoments(rig.blend_shapes, rig.moments, fit.rest, fit.weights, rig.above)
     matrix = blend.matrix(pose.relative, turns, places, rig.solver)
     none = turns.new_zeros(1, len(rig.solver.joints), 3, 4)
     matrix = matrix + rig.solver.normal_equations(turns, places, fit.rest.second, none)[0]

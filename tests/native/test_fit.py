@@ -13,7 +13,9 @@ from soma_core.plugin.registry import default_registry
 from tests.native.conftest import BETAS
 
 ROUND_TRIP = 1.0
-"""Millimetres on average, SOMA to SMPL-X's own mesh and back: two rigs, two skins."""
+"""Millimetres on average: a motion to parameters of SMPL-X, to that model's mesh, and back to a motion."""
+OTHER_SKIN = 2.0
+"""Millimetres on average between the two meshes: correctives and twist joints are not in the stand-in."""
 SAME = 1e-4
 """Metres: float32, and steps until the energy moves by less than a hundredth of a millimetre, squared."""
 POSES_OF_SAME = 5e-3
@@ -44,7 +46,7 @@ def test_round_trip(fit, layer, body, vertices, motion):
     inversion = PoseInversion(layer)
     outside = np.setdiff1d(np.arange(layer.mesh.vertex_count), layer.mesh.face_interior)
     back = inversion.canonical(motion.vertices, "native")
-    assert 1e3 * float((back - vertices).norm(dim=-1)[:, outside].mean()) < ROUND_TRIP
+    assert 1e3 * float((back - vertices).norm(dim=-1)[:, outside].mean()) < OTHER_SKIN
     result = inversion(motion.vertices, body, topology="native")
     again = layer.pose(body, result.rotations, result.translation).vertices
     assert 1e3 * float((again - vertices).norm(dim=-1)[:, outside].mean()) < ROUND_TRIP
