@@ -87,6 +87,7 @@ class AnimateConfig:
     lod: Lod = Lod.mid
     kernels: Kernels = Kernels.auto
     procedural: bool = True
+    correctives: str | None = "auto"
     device: str = "cpu"
     seed: int = 0
     write: list[Product] = field(default_factory=lambda: list(Product))
@@ -165,6 +166,8 @@ class InvertConfig:
     up: Upward | None = None
     topology: Topology = Topology.auto
     lod: FitLod = FitLod.mid
+    procedural: bool = True
+    correctives: str | None = "auto"
     device: str = "cpu"
     seed: int = 0
     chunk: int = 256
@@ -220,6 +223,7 @@ class CorrectivesData:
     """Poses that correctives are taught on: random clips, and every `step`-th frame of motion files."""
 
     random_clips: int = 140
+    hanging_clips: int = 40
     poses: int = 24
     motions: list[str] = field(default_factory=list)
     step: int = 10

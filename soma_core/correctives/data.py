@@ -33,12 +33,14 @@ class ClipPlan:
 
     Attributes:
         random_clips: clips of random poses.
+        hanging_clips: clips of random poses with hanging arms.
         poses: poses in each of them.
         motions: name -> rotations (n, J - 1, 3, 3) of motions, thinned out already.
         seed: of the random poses.
     """
 
     random_clips: int
+    hanging_clips: int
     poses: int
     motions: Mapping[str, np.ndarray]
     seed: int
@@ -53,12 +55,15 @@ def plan_clips(plan: ClipPlan, names: Sequence[str]) -> list[Clip]:
         InputError: fewer than three clips, which cannot be split.
     """
     clips = []
-    for index in range(plan.random_clips):
-        random = np.random.default_rng([plan.seed, index])
-        rotations = random_rotations(names, plan.poses, random)
-        clips.append(Clip(name=f"random {plan.seed}/{index}", rotations=rotations, seed=index))
-    for index, (name, rotations) in enumerate(plan.motions.items(), start=plan.random_clips):
-        clips.append(Clip(name=name, rotations=rotations, seed=index))
+    for kind, count in (("random", plan.random_clips), ("hanging", plan.hanging_clips)):
+        for index in range(count):
+            seed = [plan.seed, index] if kind == "random" else [plan.seed, index, 1]
+            random = np.random.default_rng(seed)
+            rotations = random_rotations(names, plan.poses, random, hanging=kind == "hanging")
+            number = index if kind == "random" else plan.random_clips + index
+            clips.append(Clip(name=f"{kind} {plan.seed}/{index}", rotations=rotations, seed=number))
+    for number, (name, rotations) in enumerate(plan.motions.items(), start=len(clips)):
+        clips.append(Clip(name=name, rotations=rotations, seed=number))
     if len(clips) < len(SPLITS):
         raise InputError(
             "data",

@@ -36,13 +36,21 @@ _LIMITS: tuple[tuple[str, tuple[_Range, _Range, _Range]], ...] = (
 )
 """Ranges of the left side, rounded from clinical tables of passive motion; the right side mirrors them."""
 
+_HANGING = {
+    "Shoulder": ((10, -6, -5), ((-12, 12), (-14, 12), (-14, 16))),
+    "Arm": ((0, -8, -60), ((-40, 40), (-35, 35), (-35, 40))),
+}
+"""Where a joint is most of the day rather than in the T-pose: centre, and ranges about it, in degrees."""
+
 
 def _twist_axis(part: str) -> int:
     """Axis about which a joint twists in the T-pose: x in the arms, y in the trunk and legs."""
     return 0 if re.search("Shoulder|Arm|Hand", part) else 1
 
 
-def random_rotations(names: Sequence[str], count: int, random: np.random.Generator) -> np.ndarray:
+def random_rotations(
+    names: Sequence[str], count: int, random: np.random.Generator, *, hanging: bool = False
+) -> np.ndarray:
     """T-pose-relative rotations, (count, J, 3, 3), within the limits of each joint.
 
     Every limb of every pose is active to a degree of its own between nothing and its full range, so that
@@ -53,6 +61,7 @@ def random_rotations(names: Sequence[str], count: int, random: np.random.Generat
         names: J joint names.
         count: poses.
         random: source of the angles.
+        hanging: the arms hang, as those of people who stand and walk do.
     """
     rotations = np.tile(np.eye(3), (count, len(names), 1, 1))
     activity: dict[str, np.ndarray] = {}
@@ -62,11 +71,14 @@ def random_rotations(names: Sequence[str], count: int, random: np.random.Generat
         limits = next((limits for pattern, limits in _LIMITS if re.fullmatch(pattern, part)), None)
         if limits is None:
             continue
+        centre: tuple[float, float, float] = (0, 0, 0)
+        if hanging:
+            centre, limits = _HANGING.get(part, (centre, limits))
         limb = side + ("Hand" if re.match(r"Hand\w", part) else "Leg" if _twist_axis(part) else "Arm")
         share = activity.setdefault(limb, random.uniform(0.15, 1.0, (count, 1)))
         low, high = np.radians(np.array(limits, float)).T
         drawn = random.uniform(-1, 1, (count, 3))
-        angles = share * np.where(drawn < 0, -drawn * low, drawn * high)
+        angles = np.radians(centre) + share * np.where(drawn < 0, -drawn * low, drawn * high)
         angles *= [1, -1, -1] if side == "Right" else 1
         rotations[:, index] = _swing_twist(angles, _twist_axis(part))
     return rotations

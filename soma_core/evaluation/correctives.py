@@ -71,7 +71,9 @@ class _Subject:
 def _unseen(rig: Rig, count: int, files: list[str]) -> dict[str, np.ndarray]:
     """Motions that no training has seen: fresh random poses, the shipped clip, and what the user names."""
     random = np.random.default_rng(_UNSEEN_SEED)
-    motions = {"random poses": random_rotations(rig.user_joint_names, count, random)}
+    names = rig.user_joint_names
+    motions = {"random poses": random_rotations(names, count, random)}
+    motions["random poses, arms hanging"] = random_rotations(names, count, random, hanging=True)
     for path in (str(assets_dir() / "motions" / "range_of_motion.npz"), *files):
         rotations = read_motion(path).rotations
         frames = np.linspace(0, len(rotations) - 1, min(count, len(rotations))).astype(int)

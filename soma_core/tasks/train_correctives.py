@@ -136,6 +136,7 @@ def _clips(config: DictConfig, rig: Rig) -> Mapping[Split, Sequence[Clip]]:
         )
     plan = ClipPlan(
         random_clips=data.random_clips,
+        hanging_clips=data.hanging_clips,
         poses=data.poses,
         motions=read_motions(data.motions, data.step),
         seed=config.seed,

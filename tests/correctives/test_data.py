@@ -13,7 +13,9 @@ HALF = 1e-3  # relative rounding of offsets in half precision
 
 
 def _plan(**changes):
-    return ClipPlan(**{"random_clips": 5, "poses": 4, "motions": {}, "seed": 3, **changes})
+    return ClipPlan(
+        **{"random_clips": 5, "hanging_clips": 0, "poses": 4, "motions": {}, "seed": 3, **changes}
+    )
 
 
 @pytest.fixture
@@ -50,6 +52,15 @@ def test_mirror_images(body):
     image = mirror_rotations(pose, names)
     np.testing.assert_allclose(image[names.index("RightArm")], raised.T, atol=1e-12)
     np.testing.assert_allclose(image[names.index("LeftArm")], np.eye(3), atol=1e-12)
+
+
+def test_hanging_arms_hang(body):
+    names = body.rig.user_joint_names
+    arm = random_rotations(names, 50, np.random.default_rng(0), hanging=True)[:, names.index("LeftArm")]
+    assert (arm[:, 1, 0] < -0.3).all()  # what points to the left in the T-pose points downwards
+    clips = plan_clips(_plan(random_clips=2, hanging_clips=3), names)
+    assert [clip.name.split()[0] for clip in clips] == ["random"] * 2 + ["hanging"] * 3
+    assert len({clip.seed for clip in clips}) == 5
 
 
 def test_a_clip_depends_on_its_number_alone(body, clips):

@@ -34,7 +34,7 @@ def lessons(body, tmp_path_factory):
     from tests.correctives.conftest import KnownTeacher
 
     store = LessonStore(tmp_path_factory.mktemp("lessons"), KnownTeacher(body), body.mesh, body.rig)
-    plan = ClipPlan(random_clips=8, poses=16, motions={}, seed=0)
+    plan = ClipPlan(random_clips=8, hanging_clips=0, poses=16, motions={}, seed=0)
     clips = plan_clips(plan, body.rig.user_joint_names)
     for clip in clips:
         store.teach(clip)
@@ -147,7 +147,8 @@ from soma_core.correctives.training import Trainer, TrainingOptions
 body = made_body()
 mesh, rig, masks = body.mesh, body.rig, body.masks
 store = LessonStore(Path(sys.argv[1]), KnownTeacher(body), mesh, rig)
-clips = plan_clips(ClipPlan(random_clips=8, poses=16, motions={}, seed=0), rig.user_joint_names)
+plan = ClipPlan(random_clips=8, hanging_clips=0, poses=16, motions={}, seed=0)
+clips = plan_clips(plan, rig.user_joint_names)
 split = split_clips(clips, held_out=0.125, seed=0)
 vertices = np.arange(0, mesh.vertex_count, 3)
 network = CorrectivesNetwork(masks.joints, masks.vertices[:, vertices].tocsr(), channels=CHANNELS, seed=1)

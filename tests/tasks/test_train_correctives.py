@@ -18,7 +18,7 @@ from tests.bodies import CPU, tiny_canonical
 from tests.correctives.conftest import CHANNELS, KnownTeacher, made_body
 
 SMALL = {
-    "data": {"random_clips": 6, "poses": 12},
+    "data": {"random_clips": 6, "hanging_clips": 0, "poses": 12},
     "channels": CHANNELS,
     "batch": 16,
     "epochs": 2,
