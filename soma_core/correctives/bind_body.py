@@ -36,6 +36,12 @@ class BindBody:
             rig_revision=rig.revision,
         )  # fmt: skip
 
+    @property
+    def bind_pose(self) -> Tensor:
+        """T-pose-relative rotations (1, J - 1, 3, 3) of the bind pose."""
+        relative: Tensor = self.animation.kinematics.get_buffer("bind_relative")
+        return relative[None]
+
     def transforms(self, relative: Tensor) -> Tensor:
         """Skinning transforms (B, T, 3, 4) of T-pose-relative rotations (B, J - 1, 3, 3); Hips in place."""
         hips = self.identity.bind_world[:, 1, :3, 3].expand(len(relative), 3)

@@ -98,7 +98,7 @@ def _section_figures(subject: _Subject) -> list[Figure]:
     rig, sections = subject.rig, subject.surface.sections
     figures = []
     for label, joint, axis in _BENDS:
-        relative = subject.surface.body.animation.kinematics.bind_relative[None].clone()
+        relative = subject.surface.body.bind_pose.clone()
         turn = np.radians(_BEND_DEG) * torch.tensor(axis, dtype=torch.float64)
         relative[0, rig.user_joint_names.index(joint)] = axis_angle_to_matrix(turn)
         centres = sections.posed_centres(subject.surface.body.transforms(relative))
@@ -120,7 +120,7 @@ def _section_figures(subject: _Subject) -> list[Figure]:
 def _exact_figures(subject: _Subject, weights: CorrectiveWeights) -> list[Figure]:
     """What holds by construction: nothing at the bind pose, nothing outside the masks."""
     rig, mesh = subject.rig, subject.mesh
-    relative = subject.surface.body.animation.kinematics.bind_relative[None]
+    relative = subject.surface.body.bind_pose
     still = float(subject.model.offsets(subject.model.features(relative)).abs().max())
     mask = vertex_mask(mesh, rig, find_creases(rig), reach=float(weights.meta["settings"]["reach"]))
     held = np.setdiff1d(np.arange(mesh.vertex_count), mask.indices)
