@@ -93,12 +93,18 @@ def _share(step: Tensor, weights: Tensor, robust: float) -> Tensor:
 def _posed(
     model: Callable[[Body], Posed], problem: Problem, relative: Tensor, translation: Tensor
 ) -> Iterator[tuple[slice, Tensor]]:
-    """Reconstruction of a few frames at a time."""
-    for first in range(0, len(relative), _POSED_AT_A_TIME):
-        chunk = slice(first, first + _POSED_AT_A_TIME)
-        scale, who = problem.bone_scale, part_of(problem.identity, chunk)
-        scale = scale[chunk] if scale is not None and len(scale) > 1 else scale
-        yield chunk, model(Body(who, relative[chunk], translation[chunk], scale)).vertices
+    """Reconstruction of a few frames at a time.
+
+    Always of as many, the last one repeated: a frame is rounded alike whatever frames are beside it.
+    """
+    count = len(relative)
+    for first in range(0, count, _POSED_AT_A_TIME):
+        chunk = slice(first, min(first + _POSED_AT_A_TIME, count))
+        which = torch.arange(first, first + _POSED_AT_A_TIME, device=relative.device).clamp_max(count - 1)
+        scale = problem.bone_scale
+        scale = scale[which] if scale is not None and len(scale) > 1 else scale
+        body = Body(part_of(problem.identity, which), relative[which], translation[which], scale)
+        yield chunk, model(body).vertices[: chunk.stop - first]
 
 
 def _by_warp(
@@ -114,7 +120,7 @@ def _by_warp(
     return skin_error(weights.crow, weights.col, point, problem.weights[0], transforms, problem.vertices)
 
 
-def part_of(identity: Identity, chunk: slice) -> Identity:
+def part_of(identity: Identity, chunk: slice | Tensor) -> Identity:
     """The identities of a chunk of frames; one identity serves every chunk."""
     if identity.batch_size == 1:
         return identity

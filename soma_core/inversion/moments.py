@@ -148,7 +148,7 @@ class SkinMoments(torch.nn.Module):
         return torch.cat(frames), origin
 
     def of_vectors(self, vectors: Tensor, rest: RestMoments) -> Tensor:
-        """``sum o w r (b; 1)^T`` (F, T, 3, 4) of vectors r at the vertices, (F, v, 3) [m], of one identity."""
+        """``sum o w r (b; 1)^T`` (F, T, 3, 4) of vectors r (F, v, 3) [m] at the vertices of one identity."""
         near, origin = self.target(vectors, rest)
         return near + origin[:, None, :, None] * rest.own[..., 3:, :]
 

@@ -92,7 +92,10 @@ class OuterLoop:
 
 
 class _Mixing:
-    """Anderson's acceleration of a fixed point of poses, frame by frame."""
+    """Anderson's acceleration of a fixed point of poses, frame by frame.
+
+    In float64, so that the difference of two near poses keeps its digits.
+    """
 
     def __init__(self) -> None:
         self.earlier: deque[tuple[Pose, Tensor]] = deque(maxlen=_MEMORY)
@@ -101,24 +104,28 @@ class _Mixing:
         """The next pose, from one and its solution, and from earlier such pairs."""
         step = change = _difference(pose, solved)
         if self.earlier:
-            steps = torch.stack([step - other for _, other in self.earlier], -1).double()
-            moves = torch.stack([_difference(other, pose) for other, _ in self.earlier], -1).double()
+            steps = torch.stack([step - other for _, other in self.earlier], -1)
+            moves = torch.stack([_difference(other, pose) for other, _ in self.earlier], -1)
             square = steps.mT @ steps
             scale = square.diagonal(dim1=-2, dim2=-1).mean(-1).clamp_min(torch.finfo(torch.float64).tiny)
             eye = torch.eye(square.shape[-1], dtype=square.dtype, device=square.device)
             factor, _ = torch.linalg.cholesky_ex(square + _RIDGE * scale[:, None, None] * eye)
-            share = torch.cholesky_solve(steps.mT @ step.double()[..., None], factor)
-            change = (step - ((moves + steps) @ share).squeeze(-1)).to(step.dtype)
+            share = torch.cholesky_solve(steps.mT @ step[..., None], factor)
+            change = step - ((moves + steps) @ share).squeeze(-1)
             change = torch.where(torch.isfinite(change).all(-1, keepdim=True), change, step)
         self.earlier.append((pose, step))
         turns = axis_angle_to_matrix(change[:, :-3].unflatten(1, (-1, 3)))
-        return replace(solved, relative=pose.relative @ turns, translation=pose.translation + change[:, -3:])
+        return replace(
+            solved,
+            relative=(pose.relative.double() @ turns).to(pose.relative.dtype),
+            translation=(pose.translation + change[:, -3:]).to(pose.translation.dtype),
+        )
 
 
 def _difference(first: Pose, second: Pose) -> Tensor:
-    """Turn of every joint [rad] and shift [m] from one pose to another, (F, 3 J + 3)."""
-    turns = matrix_to_axis_angle(first.relative.mT @ second.relative)
-    return torch.cat((turns.flatten(1), second.translation - first.translation), 1)
+    """Turn of every joint [rad] and shift [m] from one pose to another, (F, 3 J + 3), float64."""
+    turns = matrix_to_axis_angle(first.relative.double().mT @ second.relative.double())
+    return torch.cat((turns.flatten(1), second.translation.double() - first.translation.double()), 1)
 
 
 def _chosen(which: Tensor, first: Pose, second: Pose) -> Pose:

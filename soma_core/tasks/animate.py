@@ -81,6 +81,7 @@ def run(config: DictConfig, output: Path) -> None:
         device=config.device,
         kernels=str(config.kernels),
         procedural=config.procedural,
+        correctives=config.correctives,
     )
     stored = {"backend": layer.backend, "params": given_params(config.backend.params)}
     stored = dict(motion.identity) if kept else stored

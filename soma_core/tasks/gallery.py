@@ -92,6 +92,7 @@ def _bodies(name: str, config: DictConfig, pose: Motion) -> list[Body]:
         device=config.device,
         kernels=str(config.kernels),
         procedural=config.procedural,
+        correctives=config.correctives,
     )
     generator = np.random.default_rng(config.seed)
     random = _random_parameters(layer.spec, _IDENTITIES - 1, generator)

@@ -75,7 +75,10 @@ def _prepare(config: DictConfig, sequence: VertexSequence, output: Path) -> FitJ
             "fps", got=f"none in {sequence.path.name}", expected="frames per second", fix="Pass fps=30."
         )
     options, params = given_params(config.backend.options), given_params(config.backend.params)
-    layer = SomaLayer(config.backend.name, options=options, lod=str(config.lod), device=config.device)
+    layer = SomaLayer(
+        config.backend.name, options=options, lod=str(config.lod), device=config.device,
+        procedural=config.procedural, correctives=config.correctives,
+    )  # fmt: skip
     posed = PosedInput(sequence, layer, topology=str(config.topology))
     with torch.no_grad():
         identity = layer.identity(params)
@@ -91,6 +94,8 @@ def _prepare(config: DictConfig, sequence: VertexSequence, output: Path) -> FitJ
         "options": options,
         "identity": _identity_settings(config),
         "lod": layer.mesh.lod,
+        "procedural": layer.procedural,
+        "correctives": layer.correctives_file and layer.correctives_file.name,
         "inversion": fit_settings(config.inversion),
         "rig": layer.rig.revision,
     }

@@ -11,8 +11,9 @@ from soma_core.layer import SomaLayer
 from tests.bodies import randn
 
 FRAMES = 6
-EXACT_MM = 0.05
-"""Mean error of a target that the full model can meet; skinning alone is off by about a millimetre."""
+EXACT_MM = 0.1
+"""Mean error of a target that the full model can meet; a fit of plain skinning is off by 1.6 mm."""
+SAME_M = 1e-5
 SAME_MM = 0.02
 """Both solvers stop within their tolerance of the same minimum, round for round."""
 
@@ -70,6 +71,15 @@ def test_identities_of_their_own_fit_as_alone(layer, identity, target):
     for row, (vertices, who) in enumerate(((target[:1], identity), (second, other))):
         alone = inversion(vertices, who)
         assert (joint.vertex_error[row] - alone.vertex_error[0]).abs().max() < 1e-4
+
+
+@pytest.mark.parametrize("kernels", ["torch", "warp"])
+def test_a_frame_does_not_depend_on_those_beside_it(layer, identity, target, kernels):
+    inversion = PoseInversion(layer, refreshes=4, kernels=kernels)
+    whole = inversion(target, identity)
+    parts = [inversion(part, identity) for part in (target[:1], target[1:])]
+    together = torch.cat([part.vertex_error for part in parts])
+    assert (together - whole.vertex_error).abs().max() < SAME_M
 
 
 def test_outliers_hardly_matter_with_twist_either(layer, identity, target):

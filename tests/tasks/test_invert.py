@@ -28,7 +28,7 @@ FRAMES = 8
 def configured(**changes):
     settings = {
         "backend": {"name": "soma", "params": {"shape": [1.0, -0.5]}}, "lod": "low",
-        "picture": {"frames": 0}, "fps": 24.0, "unit": "m", "topology": "canonical",
+        "picture": {"frames": 0}, "fps": 24.0, "unit": "m", "topology": "canonical", "procedural": False,
     }  # fmt: skip
     return OmegaConf.merge(OmegaConf.structured(InvertConfig), settings | changes)
 
@@ -102,10 +102,31 @@ def test_the_report_says_what_was_fitted_and_how_well(source, tmp_path):
         assert 1e3 * frames["mean_error"].mean() == pytest.approx(found["mean"], rel=1e-5)
 
 
+def test_twist_and_correctives_are_fitted_unless_told_otherwise(layer, source, tmp_path):
+    """To a body of plain skinning, the full model comes near; the report says which model it is about."""
+    invert.run(configured(input=str(source), procedural=True), tmp_path / "full")
+    invert.run(configured(input=str(source)), tmp_path / "plain")
+    settings, plain = (
+        json.loads((tmp_path / name / "report.json").read_text(encoding="utf-8"))["settings"]
+        for name in ("full", "plain")
+    )
+    assert (settings["procedural"], plain["procedural"]) == (True, False)
+    assert (settings["correctives"], plain["correctives"]) == ("correctives_model.pt", None)
+    motion = read_motion(tmp_path / "full/motion.npz")
+    whole = SomaLayer("soma", lod="low")
+    identity = whole.identity(motion.identity["params"])
+    with torch.no_grad():
+        posed = whole.pose(identity, torch.as_tensor(motion.rotations), torch.as_tensor(motion.translation))
+    with np.load(source) as given, np.load(tmp_path / "full/frames.npz") as frames:
+        error = np.linalg.norm(posed.vertices.numpy() - given["vertices"], axis=-1)
+        kept = np.delete(error, layer.mesh.face_interior, 1)
+        np.testing.assert_allclose(frames["mean_error"], kept.mean(1), rtol=1e-3)
+
+
 def test_our_own_files_go_round(layer, tmp_path):
     from tests.tasks.test_animate import configured as animation
 
-    animate.run(animation(write=["npz", "usd", "glb"]), tmp_path / "made")
+    animate.run(animation(write=["npz", "usd", "glb"], procedural=False), tmp_path / "made")
     expected = read_motion(tmp_path / "made/motion.npz")
     for name in ("body.usdc", "body.glb"):
         path = tmp_path / "made" / name
@@ -253,7 +274,8 @@ def test_what_cannot_be_run_says_why(source, tmp_path, changes, said):
 def test_from_the_command_line(source, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     command = ["invert", f"input={source}", "fps=24", "unit=m", "topology=canonical", "lod=low",
-               "backend.params.shape=[1.0,-0.5]", "picture.frames=0", "hydra.run.dir=out"]  # fmt: skip
+               "backend.params.shape=[1.0,-0.5]", "picture.frames=0", "hydra.run.dir=out",
+               "procedural=false"]  # fmt: skip
     assert main(command) == EXIT_OK
     streams = capsys.readouterr()
     assert streams.out.splitlines()[-1] == "out"
