@@ -32,6 +32,6 @@ def plot_history(history: Sequence[Epoch], path: Path) -> bool:
     other = axes.twinx()
     other.plot(epochs, [100 * line["reduction"] for line in history], color="tab:green", linestyle="--")
     other.set_ylabel("validation: error to the teacher that is gone [%]", color="tab:green")
-    axes.legend()
+    axes.legend(loc="lower left")
     atomic_write(path, lambda temporary: figure.savefig(temporary, dpi=150))
     return True
