@@ -19,8 +19,8 @@ BETAS = (0.8, -0.5, 0.4, 0.3)
 
 
 @pytest.fixture(scope="session")
-def smplx_registry(tmp_path_factory):
-    """A registry whose smplx reads the stand-in, as long as the tests of this folder run."""
+def _smplx(tmp_path_factory) -> tuple[SomaLayer, NativeFit]:
+    """Both ways of the stand-in; the data folder is looked at while they are built."""
     root: Path = tmp_path_factory.mktemp("data")
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("SOMA_DATA_DIR", str(root))
@@ -28,14 +28,19 @@ def smplx_registry(tmp_path_factory):
         smplx.soma_convert(official, None)
         write_smpl_wrap(root, "smplx")
         registry = Registry()
-        registry.spec("smplx")
-        yield registry
+        return SomaLayer("smplx", registry=registry), NativeFit("smplx", registry=registry)
 
 
 @pytest.fixture(scope="session")
-def layer(smplx_registry):
+def layer(_smplx):
     """SMPL-X on the canonical mesh."""
-    return SomaLayer("smplx", registry=smplx_registry)
+    return _smplx[0]
+
+
+@pytest.fixture(scope="session")
+def fit(_smplx):
+    """The way back to SMPL-X."""
+    return _smplx[1]
 
 
 @pytest.fixture(scope="session")
@@ -53,12 +58,6 @@ def vertices(layer, body):
     )
     with torch.no_grad():
         return layer.pose(body, rotations, translation).vertices
-
-
-@pytest.fixture(scope="session")
-def fit(smplx_registry):
-    """The way back to SMPL-X."""
-    return NativeFit("smplx", registry=smplx_registry)
 
 
 @pytest.fixture(scope="session")

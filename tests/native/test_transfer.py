@@ -11,6 +11,7 @@ from soma_core.errors import InputError
 from soma_core.inversion import PoseInversion
 from soma_core.native import NativeTransfer
 from soma_core.plugin.errors import BackendError
+from soma_core.plugin.registry import Registry
 from soma_core.topology.wrap_pair import read_obj
 
 ROUNDING = 1e-9
@@ -91,4 +92,4 @@ def test_refusals(toy, toy_wrap, tmp_path, monkeypatch):
         toy(toy_wrap[:, :7])
     monkeypatch.setenv("SOMA_DATA_DIR", str(tmp_path))
     with pytest.raises(BackendError, match="garment"):
-        NativeTransfer("garment")
+        NativeTransfer("garment", registry=Registry())
