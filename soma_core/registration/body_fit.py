@@ -124,7 +124,7 @@ def _pulls(
     yield _Pull(
         vertices=np.repeat(ids[:, None], 3, 1), shares=np.tile([1.0, 0.0, 0.0], (len(ids), 1)),
         points=vertices[ids], targets=there.points, normals=there.normals,
-        weights=_weights(vertices[ids], there.points, own.normals[ids], there.normals, scale),
+        weights=~there.open * _weights(vertices[ids], there.points, own.normals[ids], there.normals, scale),
     )  # fmt: skip
     points, normals = surface.vertices[chosen], surface.normals[chosen]
     here = own.facing(points, normals)

@@ -115,6 +115,18 @@ class BodyModel:
         turned = _MIRROR[:, None] * pose.rotations[self.partner] * _MIRROR
         return replace(pose, rotations=np.where(copied[:, None, None], turned, pose.rotations))
 
+    def spun(self, pose: BodyPose, side: str, angle: float) -> BodyPose:
+        """The same body, the hand of a `side` turned about the normal of its palm by `angle` [rad]."""
+        _, joints = self.evaluate(pose)
+        wrist, middle, first, last = (
+            self.layer.joint_names.index(f"{side}Hand{part}") for part in ("", "Middle1", "Index1", "Pinky1")
+        )
+        normal = np.cross(joints[middle] - joints[wrist], joints[first] - joints[last])
+        step = np.zeros(3 * len(self.joints) + 3 + self.count)
+        place = 3 * np.searchsorted(self.joints, wrist)
+        step[place : place + 3] = angle * normal / np.linalg.norm(normal)
+        return self.moved_by(pose, step)
+
     @torch.no_grad()
     def evaluate(self, pose: BodyPose) -> tuple[np.ndarray, np.ndarray]:
         """Vertices (v, 3) and user joints (J - 1, 3), [m]."""

@@ -110,7 +110,7 @@ def _forward(
     offset = contact.points - vertices
     along = (offset * contact.normals).sum(1)
     weights = _agreement(offset, normals, contact.normals, scale)
-    weights[free] = 0
+    weights[free | contact.open] = 0
     return weights, vertices + along[:, None] * contact.normals
 
 
@@ -139,7 +139,7 @@ def _agreement(offset: np.ndarray, normals: np.ndarray, others: np.ndarray, scal
 
 
 def project(vertices: np.ndarray, surface: Surface, smooth: Smoothness, *, free: np.ndarray) -> np.ndarray:
-    """Put every vertex that is not free on the surface, on a face that looks the same way."""
+    """Put vertices on faces that look the same way; those that are free or over a hole stay."""
     normals = vertex_normals(vertices, smooth.triangles)
     contact = surface.facing(vertices, normals)
-    return np.where(free[:, None], vertices, contact.points)
+    return np.where((free | contact.open)[:, None], vertices, contact.points)

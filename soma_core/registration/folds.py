@@ -31,10 +31,10 @@ def face_normals(vertices: np.ndarray, triangles: np.ndarray) -> np.ndarray:
 def flipped_triangles(
     vertices: np.ndarray, triangles: np.ndarray, surface: Surface, free: np.ndarray
 ) -> np.ndarray:
-    """(t,) whether a face looks the other way than the surface at its corners; free corners do not count."""
+    """(t,) whether a face looks the other way than the surface at its corners, none free or over a hole."""
     contact = surface.facing(vertices, vertex_normals(vertices, triangles))
     against = (face_normals(vertices, triangles) * contact.normals[triangles].mean(1)).sum(1) <= 0
-    return against & ~free[triangles].any(1)
+    return against & ~(free | contact.open)[triangles].any(1)
 
 
 def folded_triangles(vertices: np.ndarray, start: np.ndarray, triangles: np.ndarray) -> np.ndarray:

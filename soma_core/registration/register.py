@@ -12,6 +12,7 @@ import torch
 from scipy.sparse.linalg import splu
 
 from soma_core.errors import InputError
+from soma_core.io.clip import vertex_normals
 from soma_core.layer import SomaLayer
 from soma_core.plugin.spec import Axis, Unit
 from soma_core.progress import progress
@@ -20,6 +21,7 @@ from soma_core.registration.body_fit import BodyFit, fit_body
 from soma_core.registration.body_model import BodyModel
 from soma_core.registration.deform import Smoothness, deform
 from soma_core.registration.folds import lay_down
+from soma_core.registration.strangers import refuse_distant, refuse_unlike
 from soma_core.registration.surface import Surface
 from soma_core.registration.target import Frame, Skin, find_skin
 from soma_core.rig.mesh import CanonicalMesh
@@ -37,6 +39,12 @@ _ROUGH = [0.2] * 4 + [0.1] * 3
 _STAGES = (([0.1] * 6, 20.0), ([0.05] * 6, 20.0), ([0.03] * 6, 8.0), ([0.02] * 6, 4.0), ([0.02] * 6, 2.0))
 """Scale [m] of each step of a stage, and how stiff fingers and feet are in it."""
 
+_GRIP = ([0.03] * 3 + [0.02] * 3, 8.0)
+"""The same, once limbs are in place, from hands spun by a finger's width to either side."""
+
+_SPIN, _CLEARLY = 0.3, 0.8
+"""A finger's width at the fingertips [rad], and the share of the cost that makes spinning worth it."""
+
 _TRIAL = 2
 """Steps after which hands and feet taken from the other side are compared."""
 
@@ -49,7 +57,7 @@ _COARSE_SCALE, _FINE_SCALE = 0.03, 0.02
 _SYMMETRIC = 1.5e-3
 """Mean distance [m] of a body from its mirror image up to which it counts as symmetric."""
 
-_NOT_HUMAN = 0.02
+_NOT_HUMAN = 0.01
 """Mean distance of fitted body and surface, as a share of the stature, beyond which it is no human body."""
 
 _NOTHING_LIKE = 0.04
@@ -92,7 +100,7 @@ class Registration:
         wrap: (v, 3) native unit and axes, canonical vertex order.
         frame: the unit and axes found.
         skin: the native surface it lies on.
-        filled: (v,) whether a vertex was filled.
+        filled: (v,) whether a vertex was filled, or drawn over what is masked.
         symmetric: whether both sides were wrapped alike.
         fitted: (v, 3) the parametric body, native unit and axes.
         notes: what was found and left out, for people.
@@ -130,13 +138,14 @@ def register(
     filled = _filled(options.fill, fine.mesh)
     fit, frame = _fit_best(skin, coarse, options, marks)
     surface = skin.surface(frame)
-    _refuse_strangers(fit, coarse, surface, share=_NOTHING_LIKE)
+    refuse_distant(fit, coarse, surface, share=_NOTHING_LIKE)
     symmetric = options.symmetric if options.symmetric is not None else _is_symmetric(surface)
     fit = _refine(fit, coarse, surface, symmetric, _in_frame(marks, frame, coarse.mesh.vertex_count))
-    _refuse_strangers(fit, coarse, surface, share=_NOT_HUMAN)
+    refuse_distant(fit, coarse, surface, share=_NOT_HUMAN)
     fitted, _ = fine.evaluate(fit.pose)
     marks = _in_frame(marks, frame, fine.mesh.vertex_count)
     wrap = _lay_on(fitted, surface, coarse.mesh, fine.mesh, filled, marks, symmetric)
+    filled |= surface.facing(wrap, vertex_normals(wrap, fine.triangles)).open
     notes = (
         f"unit {frame.unit}, up {frame.up}, facing {frame.forward}",
         f"{'symmetric' if symmetric else 'not symmetric'}",
@@ -153,6 +162,7 @@ def _fit_best(skin: Skin, model: BodyModel, options: WrapOptions, marks: Marks) 
     starts = find_starts(
         skin, model, unit=options.unit, up=options.up, forward=options.forward, count=_STARTS
     )
+    refuse_unlike(starts[0])
     fits = []
     for start in progress(starts, label="standing the body into the mesh", total=len(starts)):
         placed = _in_frame(marks, start.frame, model.mesh.vertex_count)
@@ -198,9 +208,27 @@ def _is_symmetric(surface: Surface) -> bool:
 
 def _refine(fit: BodyFit, model: BodyModel, surface: Surface, symmetric: bool, marks: Marks) -> BodyFit:
     """Fit in stages, from coarse to fine; of a symmetric body the better side is kept."""
-    for scales, ends in progress(_STAGES, label="fitting shape and pose", total=len(_STAGES)):
+    for number, (scales, ends) in enumerate(
+        progress(_STAGES, label="fitting shape and pose", total=len(_STAGES)), start=1
+    ):
+        if number == len(_STAGES) - 1:
+            fit = _better_grip(fit, model, surface, symmetric, marks)
         fit = fit_body(model, surface, fit.pose, scales=scales, ends=ends, landmarks=marks)
         fit = _better_side(fit, model, surface, symmetric, scale=scales[-1], ends=ends)
+    return fit
+
+
+def _better_grip(fit: BodyFit, model: BodyModel, surface: Surface, symmetric: bool, marks: Marks) -> BodyFit:
+    """Hands whose fingers lie on the wrong neighbours are tried a finger further to either side."""
+    scales, ends = _GRIP
+    for side in ("Left",) if symmetric else ("Left", "Right"):
+        spun = [model.spun(fit.pose, side, angle) for angle in (-_SPIN, _SPIN)]
+        poses = [fit.pose, *([model.like(pose, side) for pose in spun] if symmetric else spun)]
+        same, *others = (
+            fit_body(model, surface, pose, scales=scales, ends=ends, landmarks=marks) for pose in poses
+        )
+        best = min(others, key=lambda each: each.cost)
+        fit = best if best.cost < _CLEARLY * same.cost else fit
     return fit
 
 
@@ -218,23 +246,6 @@ def _better_side(
     if symmetric:
         return BodyFit(pose=poses[best], vertices=model.evaluate(poses[best])[0], cost=steps[best].cost)
     return steps[best]
-
-
-def _refuse_strangers(fit: BodyFit, model: BodyModel, surface: Surface, *, share: float) -> None:
-    stature = float(np.ptp(surface.vertices[:, 1]))
-    there = surface.closest(fit.vertices[model.skin])
-    here = Surface(fit.vertices, model.triangles).closest(surface.vertices)
-    gaps = [
-        float(np.linalg.norm(there.points - fit.vertices[model.skin], axis=1).mean()),
-        float(np.linalg.norm(here.points - surface.vertices, axis=1).mean()),
-    ]
-    if max(gaps) > share * stature:
-        raise InputError(
-            "native mesh",
-            got=f"a surface {1000 * max(gaps):.0f} mm from the nearest human body on average",
-            expected=f"at most {1000 * share * stature:.0f} mm ({share:.0%} of its height)",
-            fix="Pass one human body in a T- or A-pose; if it is one, say unit=, up= and forward=.",
-        )
 
 
 def _filled(names: Sequence[str], mesh: CanonicalMesh) -> np.ndarray:

@@ -16,6 +16,9 @@ __all__ = ["Contact", "Surface"]
 _TURN = 0.04
 """Length [m] that a unit difference of normals counts for: between the sides of a gap, the right one wins."""
 
+_ON_RIM = 1e-9
+"""Share of the corners off the rim below which a point lies on it."""
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Contact:
@@ -26,12 +29,14 @@ class Contact:
         normals: (m, 3) unit normals there, interpolated between vertices.
         faces: (m,) face ids.
         shares: (m, 3) barycentric coordinates in the face.
+        open: (m,) whether that is the rim of a hole that a mask cut: the point belongs to what is missing.
     """
 
     points: np.ndarray
     normals: np.ndarray
     faces: np.ndarray
     shares: np.ndarray
+    open: np.ndarray
 
 
 class Surface:
@@ -40,10 +45,12 @@ class Surface:
     Args:
         vertices: (n, 3) [m].
         triangles: (t, 3), counter-clockwise seen from outside.
+        rim: (n,) whether a vertex lies on the rim of a hole that a mask cut; default none.
     """
 
-    def __init__(self, vertices: np.ndarray, triangles: np.ndarray) -> None:
+    def __init__(self, vertices: np.ndarray, triangles: np.ndarray, rim: np.ndarray | None = None) -> None:
         self.vertices, self.triangles = vertices, triangles
+        self._rim = np.zeros(len(vertices), bool) if rim is None else rim
         self.normals = vertex_normals(vertices, triangles)
         corners = vertices[triangles]
         normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
@@ -69,7 +76,9 @@ class Surface:
         shares = _shares(touched, corners)
         normals = np.einsum("mk,mkc->mc", shares, self.normals[self.triangles[faces]])
         normals /= np.maximum(np.linalg.norm(normals, axis=1), 1e-300)[:, None]
-        return Contact(points=touched, normals=normals, faces=faces, shares=shares)
+        kept = ~self._rim[self.triangles[faces]]
+        cut = (shares * kept).sum(1) < _ON_RIM
+        return Contact(points=touched, normals=normals, faces=faces, shares=shares, open=cut)
 
 
 def _shares(points: np.ndarray, corners: np.ndarray) -> np.ndarray:

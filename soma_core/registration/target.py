@@ -65,15 +65,17 @@ class Skin:
         vertices: (n, 3) native.
         triangles: (t, 3), seen counter-clockwise from outside.
         notes: what was left out or turned, for people.
+        rim: (n,) whether a vertex lies beside a face that was masked; None where none was.
     """
 
     vertices: np.ndarray
     triangles: np.ndarray
     notes: tuple[str, ...] = ()
+    rim: np.ndarray | None = None
 
     def surface(self, frame: Frame) -> Surface:
         """The skin in metres, +Y up, +Z forward."""
-        return Surface(frame.to_canonical(self.vertices), self.triangles)
+        return Surface(frame.to_canonical(self.vertices), self.triangles, self.rim)
 
 
 def find_skin(vertices: np.ndarray, triangles: np.ndarray, *, masked: Sequence[int] | None = None) -> Skin:
@@ -109,7 +111,10 @@ def find_skin(vertices: np.ndarray, triangles: np.ndarray, *, masked: Sequence[i
     if _volume(points, part) < 0:
         part = part[:, ::-1].copy()
         notes.append("faces point inwards; turned")
-    return Skin(vertices=points, triangles=part, notes=tuple(notes))
+    rim = None
+    if not kept.all():
+        rim = np.isin(used, triangles[~kept[triangles].all(1)])
+    return Skin(vertices=points, triangles=part, notes=tuple(notes), rim=rim)
 
 
 def _refusal(got: object, expected: object, fix: str) -> InputError:

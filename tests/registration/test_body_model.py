@@ -44,6 +44,17 @@ def test_a_step_turns_what_hangs_on_the_joint(model: BodyModel) -> None:
     assert 1000 * np.linalg.norm(moved - predicted, axis=1).max() < STEP_MM
 
 
+def test_a_spun_hand_turns_in_its_wrist(model: BodyModel) -> None:
+    pose, names = model.start(0.5), model.layer.joint_names
+    before, after = (model.evaluate(each)[1] for each in (pose, model.spun(pose, "Left", 0.3)))
+    moved = 1000 * np.linalg.norm(after - before, axis=1)
+    wrist, knuckle = names.index("LeftHand"), names.index("LeftHandMiddle1")
+    length = 1000 * np.linalg.norm(before[knuckle] - before[wrist])
+    assert abs(moved[knuckle] - 2 * np.sin(0.15) * length) < STEP_MM
+    still = np.array([name == "LeftHand" or not name.startswith("LeftHand") for name in names])
+    assert moved[still].max() < STEP_MM
+
+
 def test_a_body_like_its_left_side_is_symmetric(model: BodyModel) -> None:
     random = np.random.default_rng(0)
     pose = model.start(0.6)

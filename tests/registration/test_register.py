@@ -11,6 +11,7 @@ from soma_core.errors import InputError
 from soma_core.plugin.registry import default_registry
 from soma_core.registration.quality import Quality, measure
 from soma_core.registration.register import Registration, WrapOptions, register
+from soma_core.registration.surface import Surface
 from soma_core.rig import load_canonical
 from soma_core.topology.wrap_pair import check_order, read_obj
 from tests.real_mhr import needs_mhr, registered_mhr
@@ -21,6 +22,8 @@ ANNY_SURFACE_MM, MHR_SURFACE_MM = 0.1, 0.3
 BODY_MEDIAN_MM, BODY_P95_MM = 5.0, 15.0
 HAND_MEDIAN_MM, HAND_P95_MM = 5.0, 15.0
 FLIPPED_PERCENT = 0.1
+HOLE_CM, OVER_HOLE_MM = 6.0, 5.0  # the back is hollow along the spine, and skin over a hole is not
+MARK_MM = 2.5  # it pulls against the smoothness of the skin around
 SIDES_MM = 0.01  # both sides of a symmetric body, where they were projected one by one
 
 TO_NATIVE = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
@@ -40,9 +43,34 @@ def anny_pair() -> tuple[tuple[np.ndarray, np.ndarray], np.ndarray]:
     return (100 * vertices @ TO_NATIVE.T, triangles), 100 * artist @ TO_NATIVE.T
 
 
+def midline(front: float) -> int:
+    """A vertex of every LOD on the midline at the height of the navel, in front (1) or in the back (-1)."""
+    mesh, _ = load_canonical("low")
+    height = np.ptp(mesh.vertices[:, 1])
+    middle = np.abs(mesh.vertices[:, 0]) < 1e-4 * height
+    level = np.abs(mesh.vertices[:, 1] - mesh.vertices[:, 1].min() - 0.6 * height) < 0.02 * height
+    return int(np.argmax(np.where(middle & level, front * mesh.vertices[:, 2], -np.inf)))
+
+
 @pytest.fixture(scope="module")
-def anny(anny_pair) -> Registration:
-    return register(*anny_pair[0])
+def hole(anny_pair) -> np.ndarray:
+    """Native vertices of a patch on the back that counts as no skin."""
+    (vertices, _), artist = anny_pair
+    return np.flatnonzero(np.linalg.norm(vertices - artist[midline(-1)], axis=1) < HOLE_CM)
+
+
+@pytest.fixture(scope="module")
+def mark(anny_pair) -> int:
+    """A native vertex on the midline, the second nearest to where the artist has the navel."""
+    (vertices, _), artist = anny_pair
+    away = np.linalg.norm((vertices - artist[midline(1)]) * [10, 1, 1], axis=1)
+    return int(np.argsort(away)[1])
+
+
+@pytest.fixture(scope="module")
+def anny(anny_pair, hole: np.ndarray, mark: int) -> Registration:
+    """With a hole and a landmark, which change nothing elsewhere."""
+    return register(*anny_pair[0], options=WrapOptions(masked=hole.tolist(), landmarks={midline(1): mark}))
 
 
 @pytest.fixture(scope="module")
@@ -58,6 +86,23 @@ def test_unit_and_axes_are_found(anny: Registration) -> None:
 
 def test_eyeballs_and_tongue_are_no_skin(anny: Registration) -> None:
     assert anny.notes[-1] == "3 smaller parts of 226, 72, 72 vertices left out"
+
+
+def test_skin_is_drawn_smoothly_over_what_is_masked(anny: Registration, anny_pair, hole: np.ndarray) -> None:
+    (vertices, triangles), artist = anny_pair
+    assert f"{len(hole)} masked vertices left out" in anny.notes
+    inside = np.linalg.norm(artist - artist[midline(-1)], axis=1) < 0.7 * HOLE_CM
+    assert inside.sum() > 8
+    assert anny.filled[inside].all()
+    contact = Surface(vertices, triangles).closest(anny.wrap[inside])
+    assert 10 * np.linalg.norm(contact.points - anny.wrap[inside], axis=1).max() < OVER_HOLE_MM
+    assert 10 * np.linalg.norm(artist - anny.wrap, axis=1)[inside].max() < BODY_P95_MM
+
+
+def test_a_landmark_is_kept(anny: Registration, anny_pair, mark: int) -> None:
+    (vertices, _), artist = anny_pair
+    assert 10 * np.linalg.norm(vertices[mark] - artist[midline(1)]) > 2 * MARK_MM
+    assert 10 * np.linalg.norm(vertices[mark] - anny.wrap[midline(1)]) < MARK_MM
 
 
 def test_the_wrap_lies_on_the_surface(anny_quality: Quality) -> None:
@@ -93,11 +138,6 @@ def test_a_body_that_our_shape_space_was_not_trained_on() -> None:
     numbers = measure(found, load_canonical("mid")[0]).as_dict()
     assert numbers["surface_distance_mm"]["mean"] < MHR_SURFACE_MM
     assert numbers["native_to_wrap_mm"]["mean"] < 2 * MHR_SURFACE_MM
-
-
-def test_a_sphere_is_no_body() -> None:
-    with pytest.raises(InputError, match=r"got a surface \d+ mm from the nearest human body on average"):
-        register(*sphere(), options=WrapOptions(unit="m", up="+y", forward="+z"))
 
 
 def test_options_out_of_range_are_refused() -> None:

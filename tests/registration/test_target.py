@@ -57,6 +57,20 @@ def test_masked_vertices_are_left_out() -> None:
     skin = find_skin(vertices, triangles, masked=hat)
     assert skin.vertices[:, 1].max() <= 0.9
     assert skin.notes == (f"{len(hat)} masked vertices left out",)
+    assert skin.rim is not None
+    assert skin.rim.sum() == 80  # the ring of vertices below the hat
+    height = skin.vertices[skin.rim, 1]
+    assert height.min() == height.max() == skin.vertices[:, 1].max()
+
+
+def test_what_lies_under_a_mask_is_open() -> None:
+    vertices, triangles = sphere()
+    skin = find_skin(vertices, triangles, masked=np.flatnonzero(vertices[:, 1] > 0.9))
+    frame = Frame(unit="m", up="+y", forward="+z", centre=(0, 0, 0))
+    points = np.array([[0, 1.0, 0.1], [0, -1.0, 0.1], [0, 0.1, 1.0]])
+    np.testing.assert_array_equal(skin.surface(frame).closest(points).open, [True, False, False])
+    np.testing.assert_array_equal(skin.surface(frame).facing(points, points).open, [True, False, False])
+    assert not find_skin(vertices, triangles).surface(frame).closest(points).open.any()
 
 
 def test_two_bodies_are_refused() -> None:
