@@ -246,7 +246,7 @@ class TrainCorrectivesConfig:
     sparsity: float = 0.01
     patience: int = 8
     ridge: float = 1e-4
-    mebibytes: float = 5.5
+    mebibytes: float = 4.7
     resume: bool = False
     seed: int = 0
     device: str = "cpu"
