@@ -384,10 +384,13 @@ def _check_api(offer: Offer, spec: BackendSpec) -> None:
 
 
 def default_registry() -> Registry:
-    """Return the registry of this process; it is read once for each value of SOMA_BACKENDS."""
-    return _registry_for(os.environ.get("SOMA_BACKENDS", ""))
+    """Return the registry of this process; it is read once for each value of SOMA_BACKENDS and SOMA_DATA_DIR.
+
+    A declaration names the files that it needs, which lie in the latter.
+    """
+    return _registry_for(os.environ.get("SOMA_BACKENDS", ""), os.environ.get("SOMA_DATA_DIR", ""))
 
 
 @functools.cache
-def _registry_for(allowed: str) -> Registry:
+def _registry_for(allowed: str, data: str) -> Registry:  # noqa: ARG001 - what declarations depend on
     return Registry(allowed=[name.strip() for name in allowed.split(",") if name.strip()])

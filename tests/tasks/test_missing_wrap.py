@@ -147,7 +147,7 @@ def test_commands_make_wraps(tmp_path, monkeypatch):
     )
     monkeypatch.setenv("SOMA_DATA_DIR", str(tmp_path))
     registry = made_of(tmp_path)
-    monkeypatch.setattr("soma_core.plugin.registry._registry_for", lambda allowed: registry)
+    monkeypatch.setattr("soma_core.plugin.registry._registry_for", lambda *_: registry)
 
     def run(*_, **__):
         with pytest.raises(BackendError, match="missing"):  # the fake makes nothing
