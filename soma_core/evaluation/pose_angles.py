@@ -1,0 +1,184 @@
+"""Rotations from vertices, the shipped default and plain skinning side by side: do the angles come back?
+
+``soma evaluate experiment=pose_angles`` runs everything. Each piece can be called alone, on any
+layer and fit::
+
+    from soma_core.evaluation.pose_angles import PIECES, exact_poses, show
+    from soma_core.evaluation.shipped_layers import default_layer, plain_layer
+
+    piece = exact_poses(default_layer, 20, 0, "low")  # layer maker, count, seed, LOD (default "mid")
+    print(show(piece))                                # the table, then the figures with their bounds
+    [(figure.name, figure.value, figure.passed) for figure in piece.figures]
+
+``PIECES`` names them all. A maker is ``make(backend, *, lod, device, dtype) -> SomaLayer``, so a lambda that
+passes these on and adds ``correctives=None`` does too. ``invert=`` takes another fit than
+``PoseInversion``, such as ``functools.partial(PoseInversion, refreshes=12)``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+
+import numpy as np
+from omegaconf import DictConfig
+
+from soma_core.evaluation.pose_angle_fits import (
+    COLUMNS,
+    Fit,
+    InversionMaker,
+    Piece,
+    fit_frames,
+    posed_vertices,
+)
+from soma_core.evaluation.pose_angle_meshes import (
+    BODIES,
+    LIMITS,
+    TestBody,
+    drifting_hips,
+    named_poses,
+    rotation_matrices,
+)
+from soma_core.evaluation.pose_angle_meshes import strong_poses as draw_strong_poses
+from soma_core.evaluation.report import Figure, Report, Table
+from soma_core.evaluation.shipped_layers import LAYERS, LayerMaker, layer_label
+from soma_core.inversion import PoseInversion
+from soma_core.layer import SomaLayer
+from soma_core.progress import progress
+from soma_core.rig.mesh import Lod
+
+__all__ = ["PIECES", "exact_poses", "run", "show", "strong_random_poses"]
+
+_MEAN_MM, _MAX_MM, _MAX_DEGREES = 0.002, 0.1, 0.2
+_NEAR_DEGREES, _MISSED_PERCENT = 1.0, 1.0
+
+
+def run(config: DictConfig) -> Report:
+    """Run every piece on both layers, `config.experiment.count` frames each, at the mid level of detail."""
+    tables, figures = [], []
+    for piece in progress(PIECES.values(), label="piece", total=len(PIECES)):
+        found = [
+            piece(make, config.experiment.count, config.seed, "mid", device=config.device)
+            for make in LAYERS.values()
+        ]
+        rows = [row for one in found for row in one.table.rows]
+        tables.append(replace(found[0].table, rows=rows))
+        figures += [*found[0].figures, *(f for one in found[1:] for f in one.without_bounds().figures)]
+    return Report(
+        title=f"Angles of pose inversion: {config.experiment.count} frames of each motion",
+        tables=tables,
+        figures=figures,
+        notes=(
+            "Both layers as users get them, in float32; each fits what it posed itself, but where another "
+            "rig is named. Angles are those of joints that move at least 50 vertices. Converged but wrong: "
+            "flagged converged with a joint beyond 2 degrees. Frames per second are those of this run, in "
+            "passing.",
+        ),
+    )
+
+
+def show(piece: Piece) -> str:
+    """A piece as text: its table, then its figures."""
+    return Report(title=piece.layer, tables=[piece.table], figures=piece.figures).as_markdown()
+
+
+def exact_poses(
+    make: LayerMaker,
+    count: int,
+    seed: int,
+    lod: Lod = "mid",
+    *,
+    invert: InversionMaker = PoseInversion,
+    device: str = "cpu",
+) -> Piece:
+    """Fit named poses, hinges and smooth motions that the layer itself posed, on several bodies."""
+    by_pose: dict[str, list[Fit]] = {}
+    by_body: dict[str, Fit] = {}
+    label = ""
+    for index, body, layer, inversion in _bodies(make, lod, invert, device):
+        label = layer_label(layer)
+        random = np.random.default_rng([seed, 11, index])
+        poses = named_poses(layer, count, random)
+        fit = _own_fit(inversion, body, np.concatenate(list(poses.values())), random)
+        by_body[body.name], begin = fit, 0
+        for name, vectors in poses.items():
+            by_pose.setdefault(name, []).append(fit.part(slice(begin, begin + len(vectors))))
+            begin += len(vectors)
+    everything = Fit.joined(list(by_body.values()))
+    rows = [everything.row("all", label)]
+    rows += [fit.row(name, label) for name, fit in by_body.items()]
+    rows += [Fit.joined(fits).row(name, label) for name, fits in by_pose.items()]
+    name = f"{label}, exact targets"
+    figures = [
+        Figure(name=f"{name}, mean", value=everything.mean_mm.mean(), unit="mm", bound=_MEAN_MM),
+        Figure(name=f"{name}, max", value=everything.max_mm.max(), unit="mm", bound=_MAX_MM),
+        Figure(name=f"{name}, max angle", value=everything.worst.max(), unit="degrees", bound=_MAX_DEGREES),
+        Figure(name=f"{name}, not converged", value=everything.not_converged, unit="%", bound=0.0),
+        Figure(name=f"{name}, converged but wrong", value=everything.wrong, unit="frames", bound=0.0),
+    ]
+    table = Table(title="poses of the layer itself", columns=("pose or body", *COLUMNS), rows=rows)
+    return Piece(layer=label, table=table, figures=figures)
+
+
+def strong_random_poses(
+    make: LayerMaker,
+    count: int,
+    seed: int,
+    lod: Lod = "mid",
+    *,
+    invert: InversionMaker = PoseInversion,
+    device: str = "cpu",
+) -> Piece:
+    """Fit strong random poses that the layer itself posed: `count` of each body and limit."""
+    fits: dict[float, list[Fit]] = {limit: [] for limit in LIMITS}
+    label = ""
+    for index, body, layer, inversion in _bodies(make, lod, invert, device):
+        label = layer_label(layer)
+        for number, limit in enumerate(LIMITS):
+            random = np.random.default_rng([seed, 12, index, number])
+            vectors = draw_strong_poses(layer, count, limit, random)
+            fits[limit].append(_own_fit(inversion, body, vectors, random))
+    joined = {f"cut at {limit} rad": Fit.joined(found) for limit, found in fits.items()}
+    everything = Fit.joined(list(joined.values()))
+    rows = [fit.row(name, label) for name, fit in ({"all": everything} | joined).items()]
+    near = everything.converged & (everything.worst <= _NEAR_DEGREES)
+    name = f"{label}, strong random poses"
+    figures = [
+        Figure(
+            name=f"{name}, not converged to within 1 degree", value=100 * float(1 - near.mean()), unit="%",
+            bound=_MISSED_PERCENT,
+        ),
+        Figure(name=f"{name}, converged but wrong", value=everything.wrong, unit="frames", bound=0.0),
+    ]  # fmt: skip
+    table = Table(title="strong random poses of the layer itself", columns=("limit", *COLUMNS), rows=rows)
+    return Piece(layer=label, table=table, figures=figures)
+
+
+def _bodies(
+    make: LayerMaker, lod: Lod, invert: InversionMaker, device: str
+) -> Iterator[tuple[int, TestBody, SomaLayer, PoseInversion]]:
+    """Number, body, layer and fit of each of `BODIES`; one layer for each backend."""
+    made: dict[str, tuple[SomaLayer, PoseInversion]] = {}
+    for index, body in enumerate(BODIES):
+        if body.backend not in made:
+            layer = make(body.backend, lod=lod, device=device)
+            made[body.backend] = layer, invert(layer)
+        yield index, body, *made[body.backend]
+
+
+def _own_fit(
+    inversion: PoseInversion, body: TestBody, vectors: np.ndarray, random: np.random.Generator
+) -> Fit:
+    """Pose a body by rotation vectors (F, J, 3) and fit it again."""
+    layer = inversion.layer
+    identity = layer.identity(body.params)
+    rotations = rotation_matrices(vectors, layer)
+    hips = drifting_hips(len(vectors), random, layer)
+    return fit_frames(inversion, posed_vertices(layer, identity, rotations, hips), identity, rotations)
+
+
+PIECES: dict[str, Callable[..., Piece]] = {
+    "exact_poses": exact_poses,
+    "strong_random_poses": strong_random_poses,
+}
+"""Name -> ``piece(make, count, seed, lod, *, invert, device)``."""
