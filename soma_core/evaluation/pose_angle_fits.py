@@ -159,7 +159,8 @@ def fit_frames(
         result = inversion(vertices, identity, **options)
         result.residual.sum().item()  # waits for the device
         seconds = time.perf_counter() - begin
-    error = 1e3 * result.vertex_error[:, inversion.default_weights > 0].double()
+    skin = torch.as_tensor(inversion.default_weights) > 0
+    error = 1e3 * result.vertex_error[:, skin].double()
     joints = visible_joints(layer) if truth is not None else np.empty(0, int)
     angles = np.empty((len(vertices), 0))
     if truth is not None:

@@ -31,6 +31,7 @@ from soma_core.evaluation.pose_angle_fits import (
     fit_frames,
     posed_vertices,
 )
+from soma_core.evaluation.pose_angle_foreign import anny_rig_hinges, anny_rig_motions
 from soma_core.evaluation.pose_angle_meshes import (
     BODIES,
     LIMITS,
@@ -180,5 +181,7 @@ def _own_fit(
 PIECES: dict[str, Callable[..., Piece]] = {
     "exact_poses": exact_poses,
     "strong_random_poses": strong_random_poses,
+    "anny_rig_motions": anny_rig_motions,
+    "anny_rig_hinges": anny_rig_hinges,
 }
 """Name -> ``piece(make, count, seed, lod, *, invert, device)``."""
