@@ -11,12 +11,13 @@ from soma_core.errors import AssetError
 from soma_core.rig.procedural import ProceduralDefinition, ProceduralRig
 from soma_core.rig.skeleton import Rig
 from soma_core.rig.stored import StoredRig
+from soma_core.rig.transforms import fused_product
 
 __all__ = ["expanded_rig", "helper_bind", "helper_transforms", "public_rig", "with_helpers"]
 
 
 def helper_transforms(world: np.ndarray, definition: ProceduralDefinition) -> np.ndarray:
-    """Place helpers on their segments, turned as their start joints: (H, 4, 4).
+    """Place helpers on their segments, turned as their start joints, bit by bit alike everywhere: (H, 4, 4).
 
     Args:
         world: (J, 4, 4) world transforms of the public joints, in the order of `main_joints`.
@@ -25,7 +26,7 @@ def helper_transforms(world: np.ndarray, definition: ProceduralDefinition) -> np
     names = definition.main_joints
     starts = [names.index(definition.segment_of(helper).start) for helper in definition.helpers]
     placed = world[starts].copy()
-    placed[:, :3, 3] = definition.place(names) @ world[:, :3, 3]
+    placed[:, :3, 3] = fused_product(definition.place(names), world[:, :3, 3])
     return placed
 
 

@@ -10,7 +10,7 @@ from fractions import Fraction
 
 import numpy as np
 
-__all__ = ["depth_order", "local_transforms", "project_rotations", "world_transforms"]
+__all__ = ["depth_order", "fused_product", "local_transforms", "project_rotations", "world_transforms"]
 
 _Matrix = list[list[Fraction]]
 
@@ -49,6 +49,27 @@ def local_transforms(world: np.ndarray, parents: np.ndarray) -> np.ndarray:
             for j in range(4):
                 local[joint, i, j] = float(sum(inverse[i][k] * exact[joint][k][j] for k in range(4)))
     return local
+
+
+def fused_product(left: np.ndarray, right: np.ndarray) -> np.ndarray:
+    """Return ``left @ right``, terms added in order and each rounded once, as a chain of fused multiply-adds.
+
+    So the shipped rig was made. BLAS gives these bits or others, by the kernel it has for a processor.
+
+    Args:
+        left: (m, n) finite; zeros are skipped.
+        right: (n, k) finite.
+    """
+    product = np.zeros((len(left), right.shape[1]))
+    factors = right.tolist()
+    for row, weights in enumerate(left.tolist()):
+        for weight, values in zip(weights, factors, strict=True):
+            if weight:
+                product[row] = [
+                    float(Fraction(weight) * Fraction(value) + Fraction(sum_before))
+                    for sum_before, value in zip(product[row].tolist(), values, strict=True)
+                ]
+    return product
 
 
 def depth_order(parents: np.ndarray) -> np.ndarray:

@@ -30,6 +30,15 @@ def _ramp_integral(position: np.ndarray, low: float, high: float) -> np.ndarray:
     return 0.5 * inside**2 / (high - low) + np.maximum(position - high, 0)
 
 
+def _along(offsets: np.ndarray, bone: np.ndarray) -> np.ndarray:
+    """Position (n,) of `offsets` (n, 3) along `bone` (3,): 0 at its start, 1 at its end.
+
+    Terms are added in a fixed order, not by BLAS: the same skin gets the same weights on every processor.
+    """
+    along, length = offsets * bone, (bone * bone).tolist()
+    return (along[:, 0] + along[:, 1] + along[:, 2]) / (length[0] + length[1] + length[2])
+
+
 def _shares(position: np.ndarray, nodes: Sequence[float]) -> np.ndarray:
     """Share (n, k) of each node in skin at `position` along the bone: smoothed hats that sum to 1."""
     passed = [np.ones_like(position)]
@@ -86,8 +95,7 @@ def spread_weights(
         if not segment.reverse:
             nodes, columns = [0.0, *nodes], [start, *columns]
         used = np.flatnonzero(dense[:, start])
-        bone = joints[end] - joints[start]
-        position = (points[used] - joints[start]) @ bone / (bone @ bone)
+        position = _along(points[used] - joints[start], joints[end] - joints[start])
         parts = _exact_parts(dense[used, start], _shares(position, nodes))
         full[used, start] = 0
         full[used[:, None], columns] = parts

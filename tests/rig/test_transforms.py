@@ -1,7 +1,13 @@
 import numpy as np
 import scipy.spatial.transform
 
-from soma_core.rig.transforms import depth_order, local_transforms, project_rotations, world_transforms
+from soma_core.rig.transforms import (
+    depth_order,
+    fused_product,
+    local_transforms,
+    project_rotations,
+    world_transforms,
+)
 
 ROUNDING = 1e-12  # a few float64 products of values below 100
 
@@ -38,6 +44,21 @@ def test_world_does_not_depend_on_the_order_of_joints():
     place = np.append(np.argsort(shuffle), -1)
     shuffled = world_transforms(local[shuffle], place[PARENTS[shuffle]])
     np.testing.assert_array_equal(shuffled, world_transforms(local, PARENTS)[shuffle])
+
+
+def test_fused_product_rounds_each_term_once_and_adds_in_order():
+    close = 1 + 2.0**-30  # its square is 1 + 2^-29 + 2^-60, of which float64 drops the last
+    found = fused_product(np.array([[-1, close], [close, -1]]), np.array([[1 + 2.0**-29, 1.0], [close, 0.0]]))
+    assert found[0, 0] == 2.0**-60
+    assert found[1, 0] == close * (1 + 2.0**-29) - close
+    assert found[:, 1].tolist() == [-1, close]
+
+
+def test_fused_product_is_the_matrix_product():
+    generator = np.random.default_rng(5)
+    left, right = generator.normal(size=(6, 5)), generator.normal(size=(5, 3))
+    left[left < 0] = 0
+    np.testing.assert_allclose(fused_product(left, right), left @ right, atol=ROUNDING)
 
 
 def test_depth_order_puts_parents_first():
