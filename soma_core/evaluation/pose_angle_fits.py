@@ -3,21 +3,24 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from soma_core.evaluation.pose_angle_meshes import BODIES, TestBody, drifting_hips, rotation_matrices
 from soma_core.evaluation.report import Figure, Table
+from soma_core.evaluation.shipped_layers import LayerMaker
 from soma_core.inversion import InversionResult, PoseInversion
 from soma_core.layer import SomaLayer
+from soma_core.rig.mesh import Lod
 from soma_core.skeleton.identity import Identity
 
 __all__ = [
-    "COLUMNS", "Fit", "InversionMaker", "Piece", "angles_between", "finger_joints", "fit_frames",
-    "posed_vertices", "visible_joints",
+    "COLUMNS", "Fit", "InversionMaker", "Piece", "angles_between", "each_body", "finger_joints",
+    "fit_frames", "own_fit", "posed_vertices", "visible_joints",
 ]  # fmt: skip
 
 InversionMaker = Callable[..., PoseInversion]
@@ -199,3 +202,31 @@ def posed_vertices(layer: SomaLayer, identity: Identity, rotations: Tensor, hips
     """Vertices (F, v, 3) [m] of one identity in many poses."""
     chunks = zip(rotations.split(_CHUNK), hips.split(_CHUNK), strict=True)
     return torch.cat([layer.pose(identity, turn, place).vertices for turn, place in chunks])
+
+
+def each_body(
+    make: LayerMaker,
+    lod: Lod,
+    invert: InversionMaker,
+    device: str,
+    bodies: Sequence[TestBody] = BODIES,
+    dtype: torch.dtype = torch.float32,
+) -> Iterator[tuple[int, TestBody, SomaLayer, PoseInversion]]:
+    """Number, body, layer and fit of each body; one layer for each backend."""
+    made: dict[str, tuple[SomaLayer, PoseInversion]] = {}
+    for index, body in enumerate(bodies):
+        if body.backend not in made:
+            layer = make(body.backend, lod=lod, device=device, dtype=dtype)
+            made[body.backend] = layer, invert(layer)
+        yield index, body, *made[body.backend]
+
+
+def own_fit(
+    inversion: PoseInversion, body: TestBody, vectors: np.ndarray, random: np.random.Generator
+) -> Fit:
+    """Pose a body by rotation vectors (F, J, 3) [rad] and fit it again."""
+    layer = inversion.layer
+    identity = layer.identity(body.params)
+    rotations = rotation_matrices(vectors, layer)
+    hips = drifting_hips(len(vectors), random, layer)
+    return fit_frames(inversion, posed_vertices(layer, identity, rotations, hips), identity, rotations)

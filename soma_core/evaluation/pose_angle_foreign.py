@@ -188,8 +188,8 @@ def anny_rig_hinges(
         Figure(name=f"{name}, turned beside the hinge, mean", value=float(others.mean()), unit="degrees"),
     ]  # fmt: skip
     columns = (
-        "body, joint", "layer", "off the axis, mean, degrees", "max", "beside the hinge, mean, degrees", "max",
-        "converged, %",
+        "body, joint", "layer", "off the axis, mean, degrees", "max", "beside the hinge, mean, degrees",
+        "max", "converged, %",
     )  # fmt: skip
     return Piece(
         layer=label,

@@ -17,34 +17,19 @@ passes these on and adds ``correctives=None`` does too. ``invert=`` takes anothe
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
 from omegaconf import DictConfig
 
-from soma_core.evaluation.pose_angle_fits import (
-    COLUMNS,
-    Fit,
-    InversionMaker,
-    Piece,
-    fit_frames,
-    posed_vertices,
-)
+from soma_core.evaluation.pose_angle_fits import COLUMNS, Fit, InversionMaker, Piece, each_body, own_fit
 from soma_core.evaluation.pose_angle_foreign import anny_rig_hinges, anny_rig_motions
-from soma_core.evaluation.pose_angle_meshes import (
-    BODIES,
-    LIMITS,
-    TestBody,
-    drifting_hips,
-    named_poses,
-    rotation_matrices,
-)
-from soma_core.evaluation.pose_angle_meshes import strong_poses as draw_strong_poses
+from soma_core.evaluation.pose_angle_meshes import LIMITS, named_poses, strong_poses
+from soma_core.evaluation.pose_angle_noise import claimed_spread, gradients, noisy_targets
 from soma_core.evaluation.report import Figure, Report, Table
 from soma_core.evaluation.shipped_layers import LAYERS, LayerMaker, layer_label
 from soma_core.inversion import PoseInversion
-from soma_core.layer import SomaLayer
 from soma_core.progress import progress
 from soma_core.rig.mesh import Lod
 
@@ -96,11 +81,11 @@ def exact_poses(
     by_pose: dict[str, list[Fit]] = {}
     by_body: dict[str, Fit] = {}
     label = ""
-    for index, body, layer, inversion in _bodies(make, lod, invert, device):
+    for index, body, layer, inversion in each_body(make, lod, invert, device):
         label = layer_label(layer)
         random = np.random.default_rng([seed, 11, index])
         poses = named_poses(layer, count, random)
-        fit = _own_fit(inversion, body, np.concatenate(list(poses.values())), random)
+        fit = own_fit(inversion, body, np.concatenate(list(poses.values())), random)
         by_body[body.name], begin = fit, 0
         for name, vectors in poses.items():
             by_pose.setdefault(name, []).append(fit.part(slice(begin, begin + len(vectors))))
@@ -133,12 +118,12 @@ def strong_random_poses(
     """Fit strong random poses that the layer itself posed: `count` of each body and limit."""
     fits: dict[float, list[Fit]] = {limit: [] for limit in LIMITS}
     label = ""
-    for index, body, layer, inversion in _bodies(make, lod, invert, device):
+    for index, body, layer, inversion in each_body(make, lod, invert, device):
         label = layer_label(layer)
         for number, limit in enumerate(LIMITS):
             random = np.random.default_rng([seed, 12, index, number])
-            vectors = draw_strong_poses(layer, count, limit, random)
-            fits[limit].append(_own_fit(inversion, body, vectors, random))
+            vectors = strong_poses(layer, count, limit, random)
+            fits[limit].append(own_fit(inversion, body, vectors, random))
     joined = {f"cut at {limit} rad": Fit.joined(found) for limit, found in fits.items()}
     everything = Fit.joined(list(joined.values()))
     rows = [fit.row(name, label) for name, fit in ({"all": everything} | joined).items()]
@@ -155,33 +140,13 @@ def strong_random_poses(
     return Piece(layer=label, table=table, figures=figures)
 
 
-def _bodies(
-    make: LayerMaker, lod: Lod, invert: InversionMaker, device: str
-) -> Iterator[tuple[int, TestBody, SomaLayer, PoseInversion]]:
-    """Number, body, layer and fit of each of `BODIES`; one layer for each backend."""
-    made: dict[str, tuple[SomaLayer, PoseInversion]] = {}
-    for index, body in enumerate(BODIES):
-        if body.backend not in made:
-            layer = make(body.backend, lod=lod, device=device)
-            made[body.backend] = layer, invert(layer)
-        yield index, body, *made[body.backend]
-
-
-def _own_fit(
-    inversion: PoseInversion, body: TestBody, vectors: np.ndarray, random: np.random.Generator
-) -> Fit:
-    """Pose a body by rotation vectors (F, J, 3) and fit it again."""
-    layer = inversion.layer
-    identity = layer.identity(body.params)
-    rotations = rotation_matrices(vectors, layer)
-    hips = drifting_hips(len(vectors), random, layer)
-    return fit_frames(inversion, posed_vertices(layer, identity, rotations, hips), identity, rotations)
-
-
 PIECES: dict[str, Callable[..., Piece]] = {
     "exact_poses": exact_poses,
     "strong_random_poses": strong_random_poses,
     "anny_rig_motions": anny_rig_motions,
     "anny_rig_hinges": anny_rig_hinges,
+    "noisy_targets": noisy_targets,
+    "claimed_spread": claimed_spread,
+    "gradients": gradients,
 }
 """Name -> ``piece(make, count, seed, lod, *, invert, device)``."""
