@@ -10,6 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from soma_core.evaluation.joint_turns import angles_between
 from soma_core.evaluation.pose_angle_meshes import BODIES, TestBody, drifting_hips, rotation_matrices
 from soma_core.evaluation.report import Figure, Table
 from soma_core.evaluation.shipped_layers import LayerMaker
@@ -19,7 +20,7 @@ from soma_core.rig.mesh import Lod
 from soma_core.skeleton.identity import Identity
 
 __all__ = [
-    "COLUMNS", "Fit", "InversionMaker", "Piece", "angles_between", "each_body", "finger_joints",
+    "COLUMNS", "Fit", "InversionMaker", "Piece", "each_body", "finger_joints",
     "fit_frames", "own_fit", "posed_vertices", "visible_joints",
 ]  # fmt: skip
 
@@ -188,13 +189,6 @@ def visible_joints(layer: SomaLayer) -> np.ndarray:
 def finger_joints(name: str) -> bool:
     """Whether a joint is one of a finger."""
     return "Hand" in name and not name.endswith("Hand")
-
-
-def angles_between(first: Tensor, second: Tensor) -> np.ndarray:
-    """Angles (...) [degrees] between rotations (..., 3, 3)."""
-    difference = first.detach().cpu().double() - second.detach().cpu().double()
-    chord = difference.square().sum((-1, -2)).sqrt() / (2 * 2**0.5)
-    return np.degrees(2 * np.arcsin(chord.clamp(max=1).numpy()))
 
 
 @torch.no_grad()

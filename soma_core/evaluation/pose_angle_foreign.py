@@ -3,25 +3,25 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from soma_core.evaluation.anny_rig import BONES_OF, HINGE_BONES, AnnyClip, hinge_clip, smooth_clip
-from soma_core.evaluation.pose_angle_fits import Fit, InversionMaker, Piece, angles_between, fit_frames
+from soma_core.evaluation.anny_rig import HINGE_BONES, AnnyClip, hinge_clip, smooth_clip
+from soma_core.evaluation.joint_turns import TurnExcess, angles_between, bone_turns, turn_excess
+from soma_core.evaluation.pose_angle_fits import Fit, InversionMaker, Piece, fit_frames
 from soma_core.evaluation.pose_angle_meshes import ANNY_BODIES
 from soma_core.evaluation.report import Figure, Table
 from soma_core.evaluation.shipped_layers import LayerMaker, layer_label, plain_layer
 from soma_core.geometry.rotations import matrix_to_axis_angle
-from soma_core.inversion import PoseInversion
+from soma_core.inversion import InversionResult, PoseInversion
 from soma_core.inversion.priors import HINGES, hinge_rotation
 from soma_core.layer import SomaLayer
 from soma_core.rig.mesh import Lod
 from soma_core.skeleton.identity import Identity
 
-__all__ = ["TurnExcess", "anny_rig_hinges", "anny_rig_motions", "turn_excess"]
+__all__ = ["anny_rig_hinges", "anny_rig_motions"]
 
 _OVER_PLAIN_MM, _EXCESS_DEGREES, _MISSED_PERCENT, _OFF_AXIS_DEGREES = 0.1, 10.0, 1.0, 15.0
 
@@ -30,21 +30,6 @@ _BENT_ENOUGH = np.radians(30.0)
 
 _CLIP = 100
 """Frames of a whole motion; of a shorter one the first are taken, so that frames stay as near in time."""
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class TurnExcess:
-    """Frame-to-frame turns [degrees]: of the joint and frame that turns most beyond its bones.
-
-    Attributes:
-        joint: its name.
-        excess: its turn beyond that of the bone that turned most.
-        true: that bone's turn.
-    """
-
-    joint: str
-    excess: float
-    true: float
 
 
 def anny_rig_motions(
@@ -74,7 +59,7 @@ def anny_rig_motions(
         clip = _first(clip, count)
         fit = fit_frames(inversion, clip.vertices, layer.identity(params), topology="native")
         known = fit_frames(reference, clip.vertices, other.identity(params), topology="native")
-        excess = turn_excess(layer, fit, clip)
+        excess = turn_excess(layer, _result(fit).rotations, bone_turns(clip))
         over.append(float(fit.mean_mm.mean() - known.mean_mm.mean()))
         rows.append((who, label, *_cells(fit, over[-1], excess)))
         fits.append(fit)
@@ -112,36 +97,16 @@ def _cells(fit: Fit, over: float, excess: TurnExcess) -> tuple[str | float | Non
     )  # fmt: skip
 
 
+def _result(fit: Fit) -> InversionResult:
+    assert fit.result is not None, "a fit that was just made"
+    return fit.result
+
+
 def _first(clip: AnnyClip, count: int) -> AnnyClip:
     """The first frames of a motion."""
     return AnnyClip(
         vertices=clip.vertices[:count], bones=clip.bones[:count], names=clip.names, bent=clip.bent[:count]
     )
-
-
-def turn_excess(layer: SomaLayer, fit: Fit, clip: AnnyClip) -> TurnExcess:
-    """The body joint and frame whose turn in the world goes farthest beyond that of its bones."""
-    assert fit.result is not None, "a fit that was just made"
-    turns = world_turns(layer, fit.result.rotations)
-    ours = angles_between(turns[1:], turns[:-1])
-    theirs = angles_between(clip.bones[1:], clip.bones[:-1])
-    worst = TurnExcess(joint="", excess=-np.inf, true=0.0)
-    for joint, bones in BONES_OF.items():
-        own = ours[:, layer.joint_names.index(joint)]
-        true = theirs[:, [clip.names.index(bone) for bone in bones]].max(axis=1)
-        frame = int((own - true).argmax())
-        if own[frame] - true[frame] > worst.excess:
-            worst = TurnExcess(joint=joint, excess=float(own[frame] - true[frame]), true=float(true[frame]))
-    return worst
-
-
-def world_turns(layer: SomaLayer, rotations: Tensor) -> Tensor:
-    """Turns (F, J - 1, 3, 3) in the world from the T-pose, of T-pose-relative rotations of the same shape."""
-    found: list[Tensor] = []
-    for joint, parent in enumerate(layer.rig.parents[1:]):
-        own = rotations[:, joint]
-        found.append(own if parent <= 0 else found[parent - 1] @ own)
-    return torch.stack(found, 1)
 
 
 def anny_rig_hinges(
@@ -218,8 +183,7 @@ def _off_hinge(
     layer: SomaLayer, fit: Fit, clip: AnnyClip, rest: Tensor
 ) -> tuple[Mapping[str, np.ndarray], Mapping[str, np.ndarray]]:
     """Joint -> angles [degrees] between its axis and the hinge's, of bent frames; and what is beside it."""
-    assert fit.result is not None, "a fit that was just made"
-    rotations = fit.result.rotations.double().cpu()
+    rotations = _result(fit).rotations.double().cpu()
     off, beside = {}, {}
     bent = clip.bent > _BENT_ENOUGH
     for joint, (_, parent) in HINGE_BONES.items():

@@ -8,11 +8,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from soma_core.evaluation.joint_turns import angles_between
 from soma_core.evaluation.pose_angle_fits import (
     Fit,
     InversionMaker,
     Piece,
-    angles_between,
     each_body,
     finger_joints,
     fit_frames,
