@@ -13,7 +13,10 @@ from omegaconf import OmegaConf
 
 from soma_core.config.schema import InversionChoice
 from soma_core.errors import InputError
-from soma_core.evaluation.inversion_sequences import MovingMesh, plain_layer
+from soma_core.evaluation.inversion_sequences import MovingMesh
+from soma_core.evaluation.joint_turns import TurnExcess, angles_between, turn_excess
+from soma_core.evaluation.pose_angle_fits import WRONG_DEGREES, visible_joints
+from soma_core.evaluation.shipped_layers import LayerMaker, layer_label
 from soma_core.inversion import InversionResult, PoseInversion
 from soma_core.inversion.options import inversion_options
 from soma_core.inversion.report import InversionReport
@@ -21,19 +24,20 @@ from soma_core.layer import SomaLayer
 from soma_core.paths import configs_dir
 from soma_core.progress import progress
 
-__all__ = ["DEFAULT_METHOD", "MethodRun", "joint_angle_errors", "method_options", "run_methods"]
+__all__ = ["COLUMNS", "DEFAULT_METHOD", "MethodRun", "joint_angle_errors", "method_options", "run_methods"]
 
 DEFAULT_METHOD = "gauss_newton"
 """The method that bounds are held against; it is the default of ``soma invert``."""
 
-_LEAST_VERTICES = 50
-"""A joint that moves fewer vertices hardly shows in them."""
-
-_NOTICEABLE = 0.01
-"""Skin weight above which a vertex moves with a joint."""
-
 _WARM_UP = 2
 """Frames fitted before the clock runs."""
+
+
+COLUMNS = (
+    "method", "layer", "mean, mm", "median, mm", "P95, mm", "max, mm", "angle, mean, degrees", "max",
+    "turn beyond the true one, degrees", "converged, %", "converged but wrong, frames", "frames/s",
+)  # fmt: skip
+"""Of a table of runs."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -42,24 +46,37 @@ class MethodRun:
 
     Attributes:
         method: its name in the hydra group ``inversion``.
+        layer: ``default`` or ``plain``.
         name: what was fitted.
         summary: ``InversionReport.as_dict`` over all frames.
         frames_per_second: of the fit, on this machine, in passing.
-        angles: errors of the joint rotations [degrees] where the truth is known, else empty.
+        angles: errors of the joint rotations [degrees] where the truth is known, else empty; flat.
+        wrong: frames that are flagged converged and have a joint beyond two degrees.
+        excess: the greatest turn of a body joint between two frames beyond the true one; None without a
+            truth or a second frame.
     """
 
     method: str
+    layer: str
     name: str
     summary: dict[str, Any]
     frames_per_second: float
     angles: np.ndarray
+    wrong: int
+    excess: TurnExcess | None
 
-    def error_row(self) -> tuple[str, float, float, float, float, float]:
-        """Method, mean, median, P95 and maximum [mm], frames per second."""
-        found = self.summary["error_mm"]["all"]
+    def row(self, name: str | None = None) -> tuple[str | float | None, ...]:
+        """A row under `COLUMNS`, which begins with `name` in place of the method."""
+        known = self.angles.size > 0
         return (
-            self.method,
-            *(found[key] for key in ("mean", "median", "p95", "max")),
+            name or self.method,
+            self.layer,
+            *(self.summary["error_mm"]["all"][key] for key in ("mean", "median", "p95", "max")),
+            float(self.angles.mean()) if known else None,
+            float(self.angles.max()) if known else None,
+            None if self.excess is None else self.excess.excess,
+            100 - self.not_converged,
+            self.wrong if known else None,
             self.frames_per_second,
         )
 
@@ -73,15 +90,18 @@ class MethodRun:
 def run_methods(
     meshes: Iterable[MovingMesh],
     methods: Sequence[str],
+    make: LayerMaker,
     *,
     device: str,
-    plain: bool = True,
     refreshes: int | None = None,
 ) -> tuple[dict[str, MethodRun], list[MethodRun]]:
     """Fit all meshes by all methods.
 
     Args:
-        plain: fit with plain skinning, else with the full model.
+        meshes: what is fitted.
+        methods: names in the hydra group ``inversion``.
+        make: makes the layer that fits.
+        device: of the layer.
         refreshes: in place of the method's own.
 
     Returns:
@@ -91,7 +111,6 @@ def run_methods(
         InputError: no config ``inversion/<method>`` exists.
     """
     meshes = list(meshes)
-    make = plain_layer if plain else SomaLayer
     layers = {name: make(name, device=device) for name in {mesh.backend for mesh in meshes}}
     shown = DEFAULT_METHOD if DEFAULT_METHOD in methods else methods[-1]
     together, each = {}, []
@@ -141,6 +160,10 @@ class _Run:
         report.add(result)
         self.report = report.arrays()
         self.angles = joint_angle_errors(mesh, result, layer)
+        far = self.angles.max(axis=1, initial=0.0) > WRONG_DEGREES
+        self.wrong = int((result.converged.cpu().numpy() & far).sum())
+        known = mesh.turns and self.frames > 1
+        self.excess = turn_excess(layer, result.rotations, mesh.turns) if known else None
 
 
 def _gathered(runs: Sequence[_Run], method: str, name: str) -> MethodRun:
@@ -149,19 +172,22 @@ def _gathered(runs: Sequence[_Run], method: str, name: str) -> MethodRun:
         report.merge(run.report, consecutive=False)
     return MethodRun(
         method=method,
+        layer=layer_label(runs[0].layer),
         name=name,
         summary=report.as_dict(),
         frames_per_second=sum(run.frames for run in runs) / sum(run.seconds for run in runs),
-        angles=np.concatenate([run.angles for run in runs]),
+        angles=np.concatenate([run.angles.ravel() for run in runs]),
+        wrong=sum(run.wrong for run in runs),
+        excess=max((run.excess for run in runs if run.excess), key=lambda one: one.excess, default=None),
     )
 
 
 def joint_angle_errors(mesh: MovingMesh, result: InversionResult, layer: SomaLayer) -> np.ndarray:
-    """Angles [degrees] between fitted and true rotations, of joints that move enough vertices; flat."""
+    """Angles (F, K) [degrees] between fitted and true rotations, of joints that move enough vertices.
+
+    K is 0 where the truth is not known.
+    """
     if mesh.rotations is None:
-        return np.empty(0)
-    moved = np.asarray((layer.rig.weights > _NOTICEABLE).sum(axis=0)).ravel()[1:]
-    joints = np.flatnonzero(moved >= _LEAST_VERTICES)
-    difference = (result.rotations.cpu() - mesh.rotations).double()[:, joints]
-    chord = difference.square().sum((-1, -2)).sqrt() / (2 * 2**0.5)
-    return np.degrees(2 * np.arcsin(chord.clamp(max=1).numpy())).ravel()
+        return np.empty((len(result.rotations), 0))
+    joints = visible_joints(layer)
+    return angles_between(result.rotations[:, joints], mesh.rotations[:, joints])

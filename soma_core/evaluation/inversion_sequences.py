@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -13,8 +12,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from soma_core.evaluation.anny_package import anny_package_model
+from soma_core.evaluation.anny_rig import smooth_clip
+from soma_core.evaluation.joint_turns import bone_turns, own_turns
+from soma_core.evaluation.pose_angle_fits import posed_vertices
 from soma_core.evaluation.random_poses import joint_spread, smooth_axis_angles
+from soma_core.evaluation.shipped_layers import LayerMaker
 from soma_core.geometry.rotations import axis_angle_to_matrix
 from soma_core.io import read_motion
 from soma_core.layer import SomaLayer
@@ -28,21 +30,6 @@ ANNY_IDENTITIES: dict[str, dict[str, float]] = {
     "child": {"gender": 0.6, "age": 0.35, "muscle": 0.5, "weight": 0.4, "height": 0.5, "proportions": 0.4},
 }
 """Phenotypes of the bodies that move; what is not named keeps its default."""
-
-_BONE_SPREAD = (
-    (r"root", 0.4),
-    (r"toe.*|metacarpal.*", 0.06),
-    (r"finger.*", 0.3),
-    (r"wrist.*", 0.4),
-    (r"upperarm.*", 0.52),
-    (r"lowerarm.*|lowerleg.*", 0.4),
-    (r"shoulder.*|clavicle.*|spine.*|neck.*", 0.14),
-    (r"upperleg.*", 0.46),
-    (r"foot.*", 0.29),
-    (r"head", 0.23),
-    (r"eye.*", 0.12),
-)
-"""Bones of Anny's rig -> how far they turn [rad]; bones not listed stay at rest."""
 
 _HIPS = (0.1, 0.95, 0.0)
 _STEP = 0.01
@@ -59,6 +46,8 @@ class MovingMesh:
         vertices: (frames, n, 3), as `topology` says.
         topology: ``canonical`` (metres, +Y up, mid LOD) or ``native`` (the backend's own).
         rotations: (frames, J - 1, 3, 3) true rotations; None where another rig posed the body.
+        turns: body joint -> how far it truly turns in the world between frames, (frames - 1,) [degrees]; of
+            another rig, how far the bone does that carries the same skin. Empty where nothing is known.
     """
 
     name: str
@@ -67,25 +56,16 @@ class MovingMesh:
     vertices: Tensor
     topology: Literal["canonical", "native"] = "canonical"
     rotations: Tensor | None = None
+    turns: Mapping[str, np.ndarray] = field(default_factory=dict)
 
 
-def plain_layer(name: str, *, device: torch.device | str = "cpu") -> SomaLayer:
-    """A layer that skins by the 78 public joints alone, as the paper's inversion and its peers do."""
-    return SomaLayer(name, procedural=False, correctives=None, device=device)
-
-
-def full_model_meshes(count: int, seed: int) -> Iterator[MovingMesh]:
-    """Meshes that the full model posed, with twist joints and correctives: two bodies in smooth motion."""
-    return _smooth(SomaLayer("anny"), SomaLayer("soma"), count, seed)
-
-
-def own_meshes(count: int, seed: int) -> Iterator[MovingMesh]:
-    """Meshes that plain skinning posed, so that an exact solution exists: smooth and recorded motions.
+def own_meshes(count: int, seed: int, make: LayerMaker) -> Iterator[MovingMesh]:
+    """Meshes that a layer posed itself, so that an exact solution exists: smooth and recorded motions.
 
     Motions are the project's own clip and those in the folder ``motions`` of SOMA_TEST_DATA, each cut to
     `count` frames spread over it.
     """
-    anny, native = plain_layer("anny"), plain_layer("soma")
+    anny, native = make("anny"), make("soma")
     yield from _smooth(anny, native, count, seed)
     for path in (assets_dir() / "motions/range_of_motion.npz", *_recorded()):
         motion = read_motion(path)
@@ -115,44 +95,31 @@ def _recorded() -> Sequence[Path]:
 def _posed(
     layer: SomaLayer, params: Mapping[str, Any], rotations: Tensor, hips: Tensor, name: str
 ) -> MovingMesh:
-    vertices = layer.pose(layer.identity(params), rotations, hips).vertices
-    return MovingMesh(name=name, backend=layer.backend, params=params, vertices=vertices, rotations=rotations)
+    return MovingMesh(
+        name=name, backend=layer.backend, params=params, rotations=rotations,
+        vertices=posed_vertices(layer, layer.identity(params), rotations, hips),
+        turns=own_turns(layer, rotations),
+    )  # fmt: skip
 
 
 def anny_meshes(count: int, seed: int) -> Iterator[MovingMesh]:
     """Meshes that the anny package posed with its own 104 bones and skinning, as native vertices."""
     for index, who in enumerate(("woman", "child")):
-        random = np.random.default_rng([seed, 2, index])
-        vertices = anny_native_vertices(ANNY_IDENTITIES[who], count, random)
+        clip = smooth_clip(ANNY_IDENTITIES[who], count, np.random.default_rng([seed, 2, index]))
         yield MovingMesh(
             name=f"anny's own rig, {who}",
             backend="anny",
             params=ANNY_IDENTITIES[who],
-            vertices=vertices,
+            vertices=clip.vertices,
             topology="native",
+            turns=bone_turns(clip),
         )
 
 
-@torch.no_grad()
 def anny_native_vertices(params: Mapping[str, float], count: int, random: np.random.Generator) -> Tensor:
     """Posed vertices (count, n, 3) [m], +Z up, of a smooth motion of Anny's own rig.
 
     Raises:
         InputError: the anny package is not installed.
     """
-    model = anny_package_model(rig="anny", topology="anny", dtype=torch.float32)
-    turns = smooth_axis_angles(_bone_spread(model.bone_labels), count, random)
-    deltas = torch.eye(4).repeat(count, len(model.bone_labels), 1, 1)
-    deltas[..., :3, :3] = axis_angle_to_matrix(torch.as_tensor(turns)).float()
-    drift = np.cumsum(_STEP * random.standard_normal((count, 3)), axis=0)
-    deltas[:, 0, :3, 3] = torch.as_tensor(drift).float()
-    phenotypes = {name: torch.full((count,), value) for name, value in params.items()}
-    return model(pose_parameters=deltas, phenotype_kwargs=phenotypes)["vertices"]
-
-
-def _bone_spread(names: Sequence[str]) -> np.ndarray:
-    found = [
-        next((spread for pattern, spread in _BONE_SPREAD if re.fullmatch(pattern, name)), 0.0)
-        for name in names
-    ]
-    return np.array(found)
+    return smooth_clip(params, count, random).vertices
