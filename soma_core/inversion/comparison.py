@@ -8,14 +8,15 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from soma_core.animation.engine import Animation, Body
+from soma_core.animation.engine import Body, ProceduralAnimation
 from soma_core.animation.posed import Posed
 from soma_core.animation.skinning import skinning_transforms
 from soma_core.inversion.problem import Problem
+from soma_core.kernels.model_residual import ModelResidual
 from soma_core.layer import SomaLayer
 from soma_core.skeleton.identity import Identity
 
-__all__ = ["compare", "linear_targets", "part_of"]
+__all__ = ["compare", "linear_targets", "model_inputs", "part_of", "residual_model"]
 
 _POSED_AT_A_TIME = 32
 """Frames posed and compared at a time by the reference, so that they stay in cache."""
@@ -34,18 +35,70 @@ def compare(
         problem: targets, weights and identity.
         relative: user joints' rotations (F, J - 1, 3, 3).
         translation: Hips positions (F, 3) [m], in the world.
-        warp: run the Warp twin for plain skinning of one identity under one set of weights.
+        warp: run the Warp twin; it writes no posed vertex.
     """
-    identity, weights = problem.identity, problem.weights
-    if warp and layer.plain and identity.batch_size == 1 and len(weights) == 1:
-        error, total = _by_warp(layer.animation, problem, relative, translation)
+    weights = problem.weights
+    if warp:
+        transforms, activations, scale = model_inputs(layer, problem, relative)
+        identity = problem.identity
+        energy, _, _, error = residual_model(layer, warp=True)(
+            identity.rest, weights, transforms, activations, scale, problem.vertices, translation,
+            gradient=False, distances=True,
+        )  # fmt: skip
+        assert error is not None
     else:
         error = problem.vertices.new_empty(problem.vertices.shape[:2])
         for chunk, posed in _posed(layer.pose_checked, problem, relative, translation):
             step = posed.sub_(problem.vertices[chunk])
             torch.linalg.vector_norm(step, dim=-1, out=error[chunk])
-        total = (error * error * weights).sum(1)
-    return error, (total / weights.sum(1).clamp_min(torch.finfo(weights.dtype).tiny)).sqrt()
+        energy = (error * error * weights).sum(1)
+    return error, (energy / weights.sum(1).clamp_min(torch.finfo(weights.dtype).tiny)).sqrt()
+
+
+def residual_model(layer: SomaLayer, *, warp: bool) -> ModelResidual:
+    """The layer's forward model, to be compared with targets; made once and kept with what poses.
+
+    Args:
+        layer: with twist joints and correctives if it has any.
+        warp: run the Warp twin.
+    """
+    posing = layer.animation if layer.plain else layer.posing
+    name = f"_residual_model_{warp}"
+    if name not in vars(posing):
+        model = ModelResidual(
+            posing.posed_skinning.weights.csr,
+            None if layer.plain or layer.correctives is None else layer.correctives.second,
+            dtype=posing.posed_skinning.weights.val.dtype,
+            device=posing.posed_skinning.weights.val.device,
+            warp=warp,
+        )
+        vars(posing)[name] = model  # no submodule: constants derived from its own
+    return vars(posing)[name]
+
+
+def model_inputs(
+    layer: SomaLayer, problem: Problem, relative: Tensor
+) -> tuple[Tensor, Tensor | None, Tensor | None]:
+    """What :class:`ModelResidual` takes of a pose whose Hips lie at the frame's origin.
+
+    Args:
+        layer, problem, relative: as in :func:`compare`.
+
+    Returns:
+        Transforms (F, T, 3, 4) [m], activations (F, C) and the scale (F,) of the correctives' offsets; the
+        last two None without correctives.
+    """
+    count = len(relative)
+    nowhere = relative.new_zeros(count, 3)
+    if layer.plain or not count:
+        return _few_inputs(layer, Body(problem.identity, relative, nowhere, problem.bone_scale))
+    parts = [_few_inputs(layer, body) for body in _bodies(problem, relative, nowhere)]
+    transforms, activations, scale = (
+        None if few[0] is None else torch.cat([one for one in few if one is not None])[:count]
+        for few in zip(*parts, strict=True)
+    )
+    assert transforms is not None
+    return transforms, activations, scale
 
 
 def linear_targets(
@@ -90,34 +143,45 @@ def _share(step: Tensor, weights: Tensor, robust: float) -> Tensor:
     return bound / torch.maximum(length, bound)
 
 
-def _posed(
-    model: Callable[[Body], Posed], problem: Problem, relative: Tensor, translation: Tensor
-) -> Iterator[tuple[slice, Tensor]]:
-    """Reconstruction of a few frames at a time.
+def _few_inputs(layer: SomaLayer, body: Body) -> tuple[Tensor, Tensor | None, Tensor | None]:
+    """The same of a few frames."""
+    posing = layer.animation if layer.plain else layer.posing
+    bind = body.identity.bind_world
+    vectors = posing.bone_vectors(body.identity, body.bone_scale)
+    rotations, positions = posing.kinematics(body.relative, vectors, body.translation)
+    transforms = skinning_transforms(rotations, positions, bind)
+    if isinstance(posing, ProceduralAnimation):
+        helpers = posing.twist(bind, transforms[..., :3], positions, body.bone_scale)
+        transforms = torch.cat((transforms, helpers), 1)
+    if layer.plain or layer.correctives is None:
+        return transforms, None, None
+    correctives = layer.correctives
+    active = torch.relu(correctives.first(correctives.features(body.relative).flatten(1).T.contiguous()))
+    active = torch.tanh(active) if correctives.use_tanh else active
+    return transforms, active.T, correctives.scale(bind).expand(len(transforms))
 
-    Always of as many, the last one repeated: a frame is rounded alike whatever frames are beside it.
+
+def _bodies(problem: Problem, relative: Tensor, translation: Tensor) -> Iterator[Body]:
+    """A few frames at a time.
+
+    Always as many, the last one repeated: a frame is rounded alike whatever frames are beside it.
     """
     count = len(relative)
     for first in range(0, count, _POSED_AT_A_TIME):
-        chunk = slice(first, min(first + _POSED_AT_A_TIME, count))
         which = torch.arange(first, first + _POSED_AT_A_TIME, device=relative.device).clamp_max(count - 1)
         scale = problem.bone_scale
         scale = scale[which] if scale is not None and len(scale) > 1 else scale
-        body = Body(part_of(problem.identity, which), relative[which], translation[which], scale)
-        yield chunk, model(body).vertices[: chunk.stop - first]
+        yield Body(part_of(problem.identity, which), relative[which], translation[which], scale)
 
 
-def _by_warp(
-    animation: Animation, problem: Problem, relative: Tensor, translation: Tensor
-) -> tuple[Tensor, Tensor]:
-    from soma_core.kernels.skin_error_wp import skin_error
-
-    identity, weights = problem.identity, animation.skinning.weights
-    rotations, positions = animation.kinematics(relative, problem.rest.offsets, translation)
-    transforms = skinning_transforms(rotations, positions, identity.bind_world)
-    rest = torch.cat((identity.rest[0], torch.ones_like(identity.rest[0, :, :1])), 1)
-    point = weights.val[:, None] * rest[animation.skinning.influence_vertex]
-    return skin_error(weights.crow, weights.col, point, problem.weights[0], transforms, problem.vertices)
+def _posed(
+    model: Callable[[Body], Posed], problem: Problem, relative: Tensor, translation: Tensor
+) -> Iterator[tuple[slice, Tensor]]:
+    """Reconstruction of a few frames at a time."""
+    count = len(relative)
+    for i, body in enumerate(_bodies(problem, relative, translation)):
+        chunk = slice(i * _POSED_AT_A_TIME, min((i + 1) * _POSED_AT_A_TIME, count))
+        yield chunk, model(body).vertices[: chunk.stop - chunk.start]
 
 
 def part_of(identity: Identity, chunk: slice | Tensor) -> Identity:
