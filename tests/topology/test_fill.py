@@ -12,8 +12,8 @@ EXACT_M = 1e-12
 """float64 rounding on a body of two metres."""
 MESH, _ = tiny_canonical()
 BAGS = MESH.face_interior.astype(np.int64)
-CLAMP = 1e-6
-"""The Laplacian's smallest relative weight; where right angles cancel, rounding decides whether it acts."""
+JITTER_M = 1e-3
+"""Large against rounding, small against an edge."""
 
 
 @pytest.fixture(scope="module")
@@ -115,12 +115,17 @@ def test_nothing_to_fill():
     assert len(fill.free_vertices) == 0
 
 
-def test_unit_and_frame_of_the_template_do_not_matter(regions):
-    moved = build_fill(100 * MESH.vertices[:, [2, 0, 1]] + 5, MESH.triangles, BAGS)
+def test_unit_and_frame_of_the_template_do_not_matter():
+    """On a template in general position: where opposite right angles cancel, as they do on the plain one, the
+    rounding of a processor decides whether an edge has a weight at all."""
+    template = MESH.vertices + JITTER_M * randn(MESH.vertex_count, 3, seed=6).numpy()
+    regions = build_fill(template, MESH.triangles, BAGS)
+    moved = build_fill(100 * template[:, [2, 0, 1]] + 5, MESH.triangles, BAGS)
     for region, other in zip(regions, moved, strict=True):
         expected = region.lift @ region.fit
-        np.testing.assert_allclose(other.lift @ other.fit, expected, atol=CLAMP)
-        np.testing.assert_allclose(other.harmonic, region.harmonic, atol=CLAMP)
+        np.testing.assert_allclose(other.lift @ other.fit, expected, atol=EXACT_M)
+        np.testing.assert_allclose(other.harmonic, region.harmonic, atol=EXACT_M)
+
 
 
 def test_a_region_without_neighbours_is_refused():
