@@ -127,7 +127,6 @@ def test_unit_and_frame_of_the_template_do_not_matter():
         np.testing.assert_allclose(other.harmonic, region.harmonic, atol=EXACT_M)
 
 
-
 def test_a_region_without_neighbours_is_refused():
     text = rf"fill_segments: got a region of {MESH.vertex_count} vertices with no neighbour"
     with pytest.raises(InputError, match=text):
