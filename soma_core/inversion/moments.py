@@ -20,6 +20,7 @@ from torch import Tensor
 from torch.nn.functional import embedding_bag
 
 from soma_core.geometry.sparse import sparse_product
+from soma_core.inversion.driven import DrivenRest
 from soma_core.inversion.structure import MomentStructure
 from soma_core.rig.skeleton import Rig
 from soma_core.skeleton.identity import Identity
@@ -37,6 +38,7 @@ class RestMoments:
         own: sums of weight times (local; 1)(local; 1)^T over each joint's influences, (i, T, 4, 4).
         second: ``N`` of every pair of joints that share vertices, (i, p, 4, 4).
         offsets: bone vectors in T-pose world axes, (i, J, 3) [m]; the Hips' entry is not used.
+        driven: what joints that follow from the others are read with; None without such joints.
     """
 
     local: Tensor
@@ -44,6 +46,7 @@ class RestMoments:
     own: Tensor
     second: Tensor
     offsets: Tensor
+    driven: DrivenRest | None = None
 
     @property
     def batch_size(self) -> int:
@@ -87,6 +90,12 @@ class SkinMoments(torch.nn.Module):
         keep("joint_start", _starts(structure.influence_joint, len(structure.joints)))
         keep("pair_start", _starts(structure.pair_entry, len(structure.pairs)))
         keep("pairs", structure.pairs)
+        if warp:
+            from soma_core.kernels.skin_moments_wp import tile_runs
+
+            starts = _starts(structure.influence_joint, len(structure.joints))
+            for i, one in enumerate(tile_runs(starts, structure.influence_vertex)):
+                keep(f"tile_runs_{i}", one)
         four = structure.influence_vertex[:, None].repeat(4, 1)
         spans = np.split(four, self.joint_start[1:-1].cpu().numpy())
         keep("moment_col", np.concatenate([span.T.ravel() for span in spans]))
@@ -138,8 +147,9 @@ class SkinMoments(torch.nn.Module):
         if self.warp and rest.batch_size == 1:
             from soma_core.kernels.skin_moments_wp import target_moments
 
-            constants = rest.weight[0], rest.local[0].contiguous(), rest.own[0, :, 3].contiguous()
-            return target_moments(self.joint_start, self.influence_vertex, *constants, vertices)
+            runs = tuple(self.get_buffer(f"tile_runs_{i}") for i in range(4))
+            constants = rest.weight[0], rest.local[0], rest.own[0, :, 3].contiguous()
+            return target_moments(self.joint_start, self.influence_vertex, runs, *constants, vertices)
         origin = vertices[:, self.influence_vertex[0]]
         near = vertices.double() - origin.double()[:, None]
         if rest.batch_size == 1:

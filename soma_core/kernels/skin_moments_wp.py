@@ -2,140 +2,143 @@
 
 import functools
 
+import numpy as np
 import torch
 import warp as wp
 from torch import Tensor
 
-from soma_core.kernels._lanes import as_lanes, from_lanes, in_threads, lane_count, lane_types
+from soma_core.kernels._lanes import in_threads, lane_count
+from soma_core.kernels._native import native, transposing
 from soma_core.kernels._runtime import as_warp, launching, scalar_name
 
-__all__ = ["target_moments"]
+__all__ = ["target_moments", "tile_runs"]
+
+_TILE = 64
+"""Vertices of all frames of a group that lie in the first cache together."""
 
 _ids = wp.array(dtype=wp.int64)
 
 
 @functools.cache
 def _kernel(scalar: str, lanes: int):
-    types = lane_types(scalar, lanes)
-    real, width, frames = types.real, lanes, wp.array2d(dtype=types.vec)
+    width, size = lanes, _TILE
+    real, rows = wp.array(dtype=getattr(wp, scalar)), wp.array2d(dtype=getattr(wp, scalar))
+    load, store = transposing(scalar, lanes)
+    begin, add, end = _steps(real, scalar, lanes)
     module = wp.get_module(f"soma_target_moments_{scalar}_{lanes}")
-    gather, joint_moments = _gather(types), _joint_moments(types, _write(types))
 
     @wp.kernel(module=module, enable_backward=False)
     def moments(
-        start: _ids, vertex: _ids, weight: wp.array(dtype=real), local: wp.array2d(dtype=real),
-        mean: wp.array2d(dtype=real), vertices: wp.array3d(dtype=real), points: frames,
-        origin: frames, out: frames,
+        first: int, stop: int, frames: int, count: int,
+        start: _ids, vertex: _ids, tile_run: _ids, run_joint: _ids, run_start: _ids, run_stop: _ids,
+        point: real, mean: real, vertices: real, tiles: rows, centres: rows, sums: rows,
+        origin: real, out: real,
     ):  # fmt: skip
         w = wp.tid()
-        for g in range(w, out.shape[0], points.shape[0]):
-            gather(w, g * width, vertices, points)
-            for r in range(3):
-                origin[g, r] = points[w, 3 * wp.int32(vertex[0]) + r]
-            for t in range(start.shape[0] - 1):
-                joint_moments(w, g, t, start, vertex, weight, local, mean, points, origin, out)
+        tile, centre, total = tiles[w], centres[w], sums[w]
+        joints = start.shape[0] - 1
+        stride = wp.int64(3 * count)
+        last = frames - 1
+        for g in range(first + w, stop, tiles.shape[0]):
+            f = g * width
+            for t in range(joints):
+                load(vertices, stride, 3 * wp.int32(vertex[start[t]]), 3, f, last, centre, 3 * t)
+            begin(12 * joints, total)
+            for t in range(tile_run.shape[0] - 1):
+                a = t * size
+                load(vertices, stride, 3 * a, 3 * (wp.min(a + size, count) - a), f, last, tile, 0)
+                add(t, a, tile_run, run_joint, run_start, run_stop, vertex, point, tile, centre, total)
+            end(joints, mean, centre, total)
+            store(total, 0, 12 * joints, out, wp.int64(12 * joints), 0, f, last)
+            store(centre, 0, 3, origin, wp.int64(3), 0, f, last)
 
     return moments
 
 
-def _write(types):
-    real, vec, frames = types.real, types.vec, wp.array2d(dtype=types.vec)
+def _steps(real, scalar: str, lanes: int):
+    def begin(count: int, sums: real): ...
 
-    @wp.func
-    def write(
-        g: int, k: int, t: int, x: vec, y: vec, z: vec, sums: vec, step: vec, mean: wp.array2d(dtype=real),
-        out: frames,
+    def add(
+        t: int, first: int, tile_run: _ids, run_joint: _ids, run_start: _ids, run_stop: _ids, vertex: _ids,
+        point: real, tile: real, centres: real, sums: real,
     ):  # fmt: skip
-        out[g, k] = x + mean[t, 0] * step
-        out[g, k + 1] = y + mean[t, 1] * step
-        out[g, k + 2] = z + mean[t, 2] * step
-        out[g, k + 3] = sums + mean[t, 3] * step
+        ...
 
-    return write
+    def end(joints: int, mean: real, centres: real, sums: real): ...
 
-
-def _joint_moments(types, write):
-    real, vec, frames = types.real, types.vec, wp.array2d(dtype=types.vec)
-
-    @wp.func
-    def joint_moments(
-        w: int, g: int, t: int, start: _ids, vertex: _ids, weight: wp.array(dtype=real),
-        local: wp.array2d(dtype=real), mean: wp.array2d(dtype=real), points: frames, origin: frames,
-        out: frames,
-    ):  # fmt: skip
-        """``R`` of one joint, about the origin of the frames."""
-        first = wp.int32(start[t])
-        v = 3 * wp.int32(vertex[first])
-        # Sums of steps from a vertex nearby: float32 then loses nothing in long sums.
-        c0 = points[w, v]
-        c1 = points[w, v + 1]
-        c2 = points[w, v + 2]
-        x0 = vec(real(0.0))
-        x1 = vec(real(0.0))
-        x2 = vec(real(0.0))
-        x3 = vec(real(0.0))
-        y0 = vec(real(0.0))
-        y1 = vec(real(0.0))
-        y2 = vec(real(0.0))
-        y3 = vec(real(0.0))
-        z0 = vec(real(0.0))
-        z1 = vec(real(0.0))
-        z2 = vec(real(0.0))
-        z3 = vec(real(0.0))
-        for e in range(first, wp.int32(start[t + 1])):
-            v = 3 * wp.int32(vertex[e])
-            x = weight[e] * (points[w, v] - c0)
-            y = weight[e] * (points[w, v + 1] - c1)
-            z = weight[e] * (points[w, v + 2] - c2)
-            b0 = local[e, 0]
-            b1 = local[e, 1]
-            b2 = local[e, 2]
-            x0 += b0 * x
-            x1 += b1 * x
-            x2 += b2 * x
-            x3 += x
-            y0 += b0 * y
-            y1 += b1 * y
-            y2 += b2 * y
-            y3 += y
-            z0 += b0 * z
-            z1 += b1 * z
-            z2 += b2 * z
-            z3 += z
-        k = 12 * t
-        write(g, k, t, x0, x1, x2, x3, c0 - origin[g, 0], mean, out)
-        write(g, k + 4, t, y0, y1, y2, y3, c1 - origin[g, 1], mean, out)
-        write(g, k + 8, t, z0, z1, z2, z3, c2 - origin[g, 2], mean, out)
-
-    return joint_moments
+    bodies = {begin: _BEGIN, add: _ADD, end: _END}
+    return tuple(native(body, scalar, lanes, stub) for stub, body in bodies.items())
 
 
-def _gather(types):
-    real, vec, width = types.real, types.vec, types.lanes
-    frames = wp.array2d(dtype=vec)
+_BEGIN = """
+    V* to = (V*)sums.data;
+    for (int i = 0; i < count; i++) to[i] = V{};
+"""
 
-    @wp.func
-    def gather(w: int, first: int, vertices: wp.array3d(dtype=real), points: frames):
-        """Vertices of a group of frames into row w of `points`, frames innermost."""
-        last = vertices.shape[0] - 1
-        for v in range(vertices.shape[1]):
-            for r in range(3):
-                x = vec(real(0.0))
-                for c in range(width):
-                    x[c] = vertices[wp.min(first + c, last), v, r]
-                points[w, 3 * v + r] = x
+# Sums of steps from a vertex nearby: float32 then loses nothing in long sums.
+_ADD = """
+    const V *points = (const V*)tile.data - 3 * first;
+    for (int p = tile_run.data[t]; p < tile_run.data[t + 1]; p++) {
+        const int joint = run_joint.data[p];
+        const V *centre = (const V*)centres.data + 3 * joint;
+        V f[12];
+        for (int k = 0; k < 12; k++) f[k] = V{};
+        for (long long e = run_start.data[p]; e < run_stop.data[p]; e++) {
+            const V* x = points + 3 * vertex.data[e];
+            const R* b = point.data + 4 * e;
+            for (int i = 0; i < 3; i++) {
+                const V step = x[i] - centre[i];
+                for (int k = 0; k < 4; k++) f[4 * i + k] += b[k] * step;
+            }
+        }
+        V* to = (V*)sums.data + 12 * joint;
+        for (int k = 0; k < 12; k++) to[k] += f[k];
+    }
+"""
 
-    return gather
+_END = """
+    V *to = (V*)sums.data;
+    const V *centre = (const V*)centres.data, *origin = centre;
+    for (int t = 0; t < joints; t++, centre += 3)
+        for (int i = 0; i < 3; i++)
+            for (int k = 0; k < 4; k++) *to++ += mean.data[4 * t + k] * (centre[i] - origin[i]);
+"""
+
+
+def tile_runs(start: np.ndarray, vertex: np.ndarray) -> tuple[np.ndarray, ...]:
+    """Influences by tile of vertices: each joint's, where a tile has any, lie together in the list.
+
+    Args:
+        start: (T + 1,) row starts of the joints' influences.
+        vertex: (e,) vertex of each influence, ascending within a joint.
+
+    Returns:
+        First run of every tile (tiles + 1,); of every run its joint, and where in the list it starts and
+        stops, (n,) each.
+    """
+    joint = np.repeat(np.arange(len(start) - 1), np.diff(start))
+    tile = vertex // _TILE
+    fresh = (
+        np.append(True, (np.diff(tile) != 0) | (np.diff(joint) != 0)) if len(vertex) else np.zeros(0, bool)
+    )
+    begin = np.flatnonzero(fresh)
+    stop = np.append(begin, len(vertex))[1:]
+    order = np.argsort(tile[begin], kind="stable")
+    begin, stop = begin[order], stop[order]
+    tiles = np.arange(int(tile.max(initial=-1)) + 2)
+    return np.searchsorted(tile[begin], tiles), joint[begin], begin, stop
 
 
 def target_moments(
-    start: Tensor, vertex: Tensor, weight: Tensor, local: Tensor, mean: Tensor, vertices: Tensor
-) -> tuple[Tensor, Tensor]:
+    start: Tensor, vertex: Tensor, runs: tuple[Tensor, ...], weight: Tensor, local: Tensor, mean: Tensor,
+    vertices: Tensor,
+) -> tuple[Tensor, Tensor]:  # fmt: skip
     """``R`` (F, T, 3, 4) about an origin of each frame (F, 3) [m], of one identity.
 
     Args:
         start: (T + 1,) int64, row starts of the joints' influences.
         vertex: (e,) int64, vertex of each influence.
+        runs: from :func:`tile_runs`.
         weight: (e,) skin weight times vertex weight.
         local: (e, 3) rest points about their joint [m].
         mean: (T, 4) sums of weight times (local, 1).
@@ -143,22 +146,23 @@ def target_moments(
     """
     vertices = vertices.contiguous()
     count, lanes, scalar = len(vertices), lane_count(vertices), scalar_name(vertices.dtype)
-    types, groups = lane_types(scalar, lanes), -(-count // lanes)
+    kernel, groups, joints = _kernel(scalar, lanes), -(-count // lanes), len(mean)
     new = functools.partial(torch.empty, dtype=vertices.dtype, device=vertices.device)
-    out, origin = new(groups, 12 * len(mean), lanes), new(groups, 3, lanes)
-    kernel = _kernel(scalar, lanes)
+    out, origin = new(count, joints, 3, 4), new(count, 3)
+    point = torch.cat((local * weight[:, None], weight[:, None]), 1)
 
     def run(part: slice) -> None:
-        workers = len(out[part]) if vertices.is_cuda else 1
-        points = new(workers, 3 * vertices.shape[1], lanes)
-        shown = vertices[part.start * lanes : part.stop * lanes]
+        workers = part.stop - part.start if vertices.is_cuda else 1
+        work = [new(workers, size * lanes) for size in (3 * _TILE, 3 * joints, 12 * joints)]
+        flat = [as_warp(one.view(-1)) for one in (point, mean, vertices)]
+        given = *map(as_warp, (start, vertex, *runs)), *flat, *map(as_warp, work)
         with launching(vertices) as device:
             wp.launch(
                 kernel, dim=workers,
-                inputs=[as_warp(start), as_warp(vertex), as_warp(weight), as_warp(local), as_warp(mean),
-                        as_warp(shown), *(as_lanes(one, types) for one in (points, origin[part], out[part]))],
+                inputs=[part.start, part.stop, count, vertices.shape[1], *given,
+                        as_warp(origin.view(-1)), as_warp(out.view(-1))],
                 device=device,
             )  # fmt: skip
 
     in_threads(run, groups, vertices)
-    return from_lanes(out, count, (len(mean), 3, 4)), from_lanes(origin, count, (3,))
+    return out, origin
