@@ -21,6 +21,8 @@ OTHER_VERBS = {"backends", "assets"}
 _SNIPPET = re.compile(
     r"<!-- runnable -->\n```python\n(?P<code>.*?)```\n(?:```text\n(?P<printed>.*?)```)?", re.DOTALL
 )
+_ROUNDING = re.compile(r"\b\d(\.\d+)?e-1[3-9]\b")
+"""Numbers of order one that differ by float64 rounding alone: how much is up to the processor."""
 _LINK = re.compile(r"\]\(([^)#\s]+)")
 _COMMAND = re.compile(r"\bsoma ([a-z][a-z-]*)")
 
@@ -47,7 +49,8 @@ def test_snippets_print_what_the_page_says(code, printed, tmp_path, monkeypatch)
     stream = io.StringIO()
     with contextlib.redirect_stdout(stream):
         exec(compile(code, "<snippet>", "exec"), {"__name__": "snippet"})
-    assert stream.getvalue() == (printed or "")
+    found, expected = (_ROUNDING.sub("rounding", text) for text in (stream.getvalue(), printed or ""))
+    assert found == expected
 
 
 def test_every_marked_snippet_is_found():
