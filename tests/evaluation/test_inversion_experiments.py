@@ -9,14 +9,14 @@ import torch
 from omegaconf import OmegaConf
 
 from soma_core.errors import InputError
-from soma_core.evaluation import inversion_sequences, table2_inversion, table3_regions
+from soma_core.evaluation import inversion_sequences, table2_inversion, table3_regions, unknown_identity
 from soma_core.evaluation.inversion_runs import joint_angle_errors, run_methods
 from soma_core.evaluation.inversion_sequences import MovingMesh
 from soma_core.evaluation.joint_turns import own_turns
 from soma_core.evaluation.random_poses import joint_spread, smooth_axis_angles
 from soma_core.evaluation.shipped_layers import plain_layer
 from soma_core.geometry.rotations import axis_angle_to_matrix
-from soma_core.inversion import InversionResult
+from soma_core.inversion import IdentityFit, InversionResult, PoseInversion
 from soma_core.layer import SomaLayer
 
 ANGLE_TOLERANCE = 1e-3
@@ -177,3 +177,51 @@ def test_a_missing_anny_package_is_named(monkeypatch):
         InputError, match=r"got no anny package, expected the anny package\. pip install anny"
     ):
         inversion_sequences.anny_native_vertices({}, 2, np.random.default_rng(0))
+
+
+@pytest.fixture
+def known_body(monkeypatch):
+    """One body that its layer posed in place of all, whose identity is found at once."""
+
+    def case(inversion, *_):
+        random = np.random.default_rng(0)
+        return [unknown_identity._posed(inversion, {}, random)]
+
+    def found(layer, vertices, *, method, inversion):
+        identity = layer.identity()
+        return IdentityFit(
+            identity=identity, params={}, pose=inversion(vertices, identity), frames=torch.arange(FRAMES),
+            history=(), converged=True,
+        )  # fmt: skip
+
+    monkeypatch.setattr(unknown_identity, "_LOD", "low")
+    monkeypatch.setattr(unknown_identity, "_FRAMES", FRAMES)
+    monkeypatch.setattr(unknown_identity, "_people", case)
+    monkeypatch.setattr(unknown_identity, "_own", case)
+    monkeypatch.setattr(unknown_identity, "fit_identity", found)
+
+
+def test_an_unknown_identity_is_measured_on_both_layers(known_body):
+    pytest.importorskip("soma_backend_anny")
+    report = unknown_identity.run(configured(count=1))
+    for table in report.tables:
+        assert [row[1] for row in table.rows] == ["default", "plain"]
+    values = {figure.name: figure for figure in report.figures}
+    assert values["default, anny's own rig, rest shape, worst body"].value == pytest.approx(0, abs=1e-6)
+    assert values["default, anny's own rig, rest shape, worst body"].bound == 1
+    assert values["plain, anny's own rig, rest shape, worst body"].bound is None
+    assert values["plain, anny, mean angle"].value < 0.1  # degrees
+    assert values["plain, anny's own rig, frames not converged"].value == 0
+
+
+@pytest.mark.slow
+def test_people_of_annys_own_rig_are_adults_and_an_infant(monkeypatch):
+    pytest.importorskip("anny")
+    pytest.importorskip("soma_backend_anny")
+    monkeypatch.setattr(unknown_identity, "_FRAMES", FRAMES)
+    layer = plain_layer("anny", lod="low")
+    cases = list(unknown_identity._people(PoseInversion(layer), 2, 0))
+    assert [case.name for case in cases] == ["adult 1", "adult 2", "infant"]
+    heights = [float(case.truth.rest[0, :, 1].max() - case.truth.rest[0, :, 1].min()) for case in cases]
+    assert heights[2] < 1 < min(heights[:2])
+    assert all(len(turns) == FRAMES - 1 for case in cases for turns in case.turns.values())

@@ -18,7 +18,7 @@ from tests.real_mhr import NEUTRAL, needs_mhr, registered_mhr
 from tests.standins.body import surface_wrap
 from tests.standins.mhr_files import StandIn, mhr_body
 
-BOUND_MM = 7.0
+BOUND_MM = 1.0
 OWN_MM = 3.0
 """A body of this project's own shape space, skinned alike: what one frame and low LOD leave."""
 
@@ -74,10 +74,15 @@ def test_a_person_is_found_and_shown(person, monkeypatch, low):
     monkeypatch.setattr(sam3d_frames, "make_wrap", lambda neutral: wrap)
     report = sam3d_frames.run(configured(person))
     values = {figure.name: figure for figure in report.figures}
-    assert values["sam3d_one, mean"].value < OWN_MM
-    assert values["sam3d_one, mean"].bound == BOUND_MM
+    assert values["plain, sam3d_one, mean"].value < OWN_MM
+    assert values["default, sam3d_one, mean"].bound == BOUND_MM
+    assert values["default, sam3d_one, hands, more than before it"].bound == 0
+    assert all(figure.bound is None for name, figure in values.items() if name.startswith("plain"))
     (table,) = report.tables
-    assert [row[0] for row in table.rows] == ["all", "body", "hands", "feet", "head"]
+    regions = ["all", "body", "hands", "feet", "head"]
+    assert [row[:2] for row in table.rows] == [
+        (region, layer) for layer in ("default", "plain") for region in regions
+    ]
     target, fitted = report.bodies
     mesh = load_canonical("low")[0]
     assert target.vertices.shape == fitted.vertices.shape == mesh.vertices.shape
