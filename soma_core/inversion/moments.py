@@ -61,7 +61,7 @@ class SkinMoments(torch.nn.Module):
         structure: index lists of the rig.
         rig: for the T-pose orientation of each joint.
         dtype: of the results.
-        warp: sum over vertices by the Warp twins; all but the moments of a shared identity.
+        warp: sum over vertices by the Warp twins, where no derivative is asked for.
     """
 
     def __init__(
@@ -113,11 +113,16 @@ class SkinMoments(torch.nn.Module):
 
     def rest(self, identity: Identity, weights: Tensor, offsets: Tensor) -> RestMoments:
         """Moments of identities under vertex weights (1 or i, v); `offsets` as in :class:`RestMoments`."""
-        local = self.local_points(identity)
         vertex_weight = weights.double()[:, self.influence_vertex]
-        batch = max(len(local), len(vertex_weight))
-        local, vertex_weight = local.expand(batch, -1, 3), vertex_weight.expand(batch, -1)
+        batch = max(identity.batch_size, len(vertex_weight))
+        vertex_weight = vertex_weight.expand(batch, -1)
         weight = vertex_weight * self.influence_weight
+        if self.warp and batch == 1 and not _followed(identity.rest, identity.bind_world, weights):
+            local, own, second = self._rest_by_warp(identity, weights)
+            return RestMoments(
+                local=local, weight=weight.to(self.dtype), own=own, second=second, offsets=offsets
+            )
+        local = self.local_points(identity).expand(batch, -1, 3)
         second, own = [], []
         for points, weight_v, weight_vt in zip(local, vertex_weight, weight, strict=True):
             point = torch.cat((points, torch.ones_like(points[:, :1])), 1)
@@ -131,6 +136,19 @@ class SkinMoments(torch.nn.Module):
             second=torch.stack(second).to(self.dtype),
             offsets=offsets,
         )
+
+    def _rest_by_warp(self, identity: Identity, weights: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Local points (1, e, 3), ``own`` and ``second`` of one identity."""
+        from soma_core.kernels.rest_moments_wp import rest_moments
+
+        bind = identity.bind_world[0, self.joints].double()
+        found = rest_moments(
+            (self.joint_start, self.influence_vertex, self.influence_weight.double()),
+            (self.pair_start, self.pair_influences),
+            self.orient @ bind[:, :3, :3].mT, bind[:, :3, 3], identity.rest[0].double(), weights[0].double(),
+        )  # fmt: skip
+        point, own, second = (one[None].to(self.dtype) for one in found)
+        return point[..., :3], own, second
 
     def _second(self, point: Tensor, vertex_weight: Tensor) -> Tensor:
         """``N`` (p, 4, 4) of one identity from weighted points (e, 4)."""
@@ -221,6 +239,11 @@ def _turned_moments(sums: Tensor, left: Tensor, right: Tensor, shift: Tensor) ->
     column = (left @ first[..., None]).squeeze(-1)
     row = torch.cat(((right @ other[..., None]).squeeze(-1), mass[..., None]), -1)
     return torch.cat((torch.cat((block, column[..., None]), -1), row[..., None, :]), -2)
+
+
+def _followed(*tensors: Tensor) -> bool:
+    """Whether a derivative is asked for."""
+    return torch.is_grad_enabled() and any(one.requires_grad for one in tensors)
 
 
 def _sum_rows(rows: Tensor, starts: Tensor) -> Tensor:
