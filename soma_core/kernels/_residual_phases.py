@@ -50,8 +50,7 @@ def phases(scalar: str, lanes: int) -> SimpleNamespace:
         ...
 
     def pulled(
-        run: ids, activation: short, start: ids, row: short, value: real, t: int, end: int, tile: real,
-        out: real,
+        start: ids, activation: short, value: real, first: int, stop: int, tile: real, out: real
     ):  # fmt: skip
         ...
 
@@ -144,18 +143,14 @@ _RESIDUAL = """
 """
 
 _PULL = """
-    const V* back = @BACK;
+    const V* g = @BACK;
     V* to = (V*)out.data;
-    for (int p = run.data[t]; p < run.data[end]; p++) {
-        V x = V{}, y = V{}, z = V{};
-        for (int q = start.data[p]; q < start.data[p + 1]; q++) {
-            const R* move = value.data + 3 * q;
-            const V* g = back + 3 * row.data[q];
-            x += move[0] * g[0];
-            y += move[1] * g[1];
-            z += move[2] * g[2];
+    for (int v = first; v < stop; v++, g += 3) {
+        const V x = g[0], y = g[1], z = g[2];
+        for (int e = start.data[v]; e < start.data[v + 1]; e++) {
+            const R* move = value.data + 3 * e;
+            to[activation.data[e]] += move[0] * x + move[1] * y + move[2] * z;
         }
-        to[activation.data[p]] += x + y + z;
     }
 """
 

@@ -62,7 +62,6 @@ def _kernel(scalar: str, lanes: int):
         skin_start: _ids, skin_joint: _short, skin_value: real,
         joint_run: _ids, joint_id: _short, joint_start: _ids, joint_row: _short, joint_value: real,
         move_start: _ids, move_id: _short, move_value: real,
-        active_run: _ids, active_id: _short, active_start: _ids, active_row: _short, active_value: real,
         rest: real, weights: real, transforms: real, active: real, scale: real, targets: real, origin: real,
         bound: real, turns: rows, sources: rows, pushes: rows, pulls: rows, tiles: rows,
         energy: real, forces: real, pull: real, distances: real,
@@ -86,11 +85,18 @@ def _kernel(scalar: str, lanes: int):
                     skinned(task, skin_start, skin_joint, skin_value, turns[s], weights, a, b, tile)
                     shown = (b - a) * task.measured
                     store(tile, at_length, shown, distances, wp.int64(task.vertices), a, f, task.frames - 1)
-                    runs = t + task.pulls
-                    draw(
-                        active_run, active_id, active_start, active_row, active_value, t, runs, tile, pulls[s]
+                    draw(move_start, move_id, move_value, a, a + (b - a) * task.pulls, tile, pulls[s])
+                    push(
+                        joint_run,
+                        joint_id,
+                        joint_start,
+                        joint_row,
+                        joint_value,
+                        t,
+                        t + task.pulls,
+                        tile,
+                        pushes[s],
                     )
-                    push(joint_run, joint_id, joint_start, joint_row, joint_value, t, runs, tile, pushes[s])
             for s in range(w, w + groups):
                 leave(task, (block + s - w) * width, tiles[s], pushes[s], pulls[s], energy, forces, pull)
 
@@ -234,31 +240,25 @@ def residual_tables(skin: scipy.sparse.csr_array, moves: scipy.sparse.csr_array)
         skin: (v, T) weights.
         moves: (3 v, C) offsets, the three rows of a vertex together.
     """
-    blocks = moves.tobsr((3, 1)).sorted_indices()
+    skin, moves = skin.tocsr().sorted_indices(), moves.tobsr((3, 1)).sorted_indices()
+    # The skin's entries once more by tile, then joint, then vertex: a run is one joint of a tile.
+    row = np.repeat(np.arange(skin.shape[0]), np.diff(skin.indptr))
+    order = np.lexsort((row, skin.indices, row // TILE))
+    tile, joint = row[order] // TILE, skin.indices[order]
+    runs, begin = np.unique(tile * skin.shape[1] + joint, return_index=True)
+    tiles = np.arange(-(-skin.shape[0] // TILE) + 1)
     return {
-        **_lists("skin", "joint", skin.indptr, skin.indices, skin.data, skin.shape[1]),
-        **_lists("move", "active", blocks.indptr, blocks.indices, blocks.data.reshape(-1, 3), moves.shape[1]),
-    }
-
-
-def _lists(
-    by_row: str, by_run: str, start: np.ndarray, column: np.ndarray, value: np.ndarray, columns: int
-) -> dict[str, np.ndarray]:
-    """Entries by vertex, and once more by tile, then column, then vertex: a run is one column of a tile."""
-    row = np.repeat(np.arange(len(start) - 1), np.diff(start))
-    order = np.lexsort((row, column, row // TILE))
-    code = row[order] // TILE * max(columns, 1) + column[order]
-    runs, begin = np.unique(code, return_index=True)
-    tiles = np.arange(-(-(len(start) - 1) // TILE) + 1)
-    return {
-        f"{by_row}_start": start.astype(np.int32),
-        f"{by_row}_column": _short_ids(column),
-        f"{by_row}_value": value.ravel(),
-        f"{by_run}_run": np.searchsorted(runs // max(columns, 1), tiles).astype(np.int32),
-        f"{by_run}_id": _short_ids(column[order][begin]),
-        f"{by_run}_start": np.append(begin, len(row)).astype(np.int32),
-        f"{by_run}_row": _short_ids(row[order] % TILE),
-        f"{by_run}_value": value[order].ravel(),
+        "skin_start": skin.indptr.astype(np.int32),
+        "skin_joint": _short_ids(skin.indices),
+        "skin_value": skin.data,
+        "joint_run": np.searchsorted(runs // skin.shape[1], tiles).astype(np.int32),
+        "joint_id": _short_ids(joint[begin]),
+        "joint_start": np.append(begin, len(row)).astype(np.int32),
+        "joint_row": _short_ids(row[order] % TILE),
+        "joint_value": skin.data[order],
+        "move_start": moves.indptr.astype(np.int32),
+        "move_id": _short_ids(moves.indices),
+        "move_value": moves.data.ravel(),
     }
 
 
