@@ -63,7 +63,7 @@ class ModelResidual(torch.nn.Module):
         warp: bool = False,
     ) -> None:
         super().__init__()
-        self.warp = warp
+        self.warp, self.dtype = warp, dtype
         start, joint, value = (part.cpu().numpy() for part in weights)
         vertices = len(start) - 1
         joints = int(joint.max(initial=-1)) + 1
@@ -72,7 +72,7 @@ class ModelResidual(torch.nn.Module):
         if correctives is not None:
             start, active, value = (part.cpu().numpy() for part in correctives.csr)
             moves = scipy.sparse.csr_array((value.astype(np.float64), active, start), shape=correctives.shape)
-        self.activation_count = moves.shape[1]
+        self.vertex_count, self.activation_count, self.joint_count = vertices, moves.shape[1], joints
         if warp:
             from soma_core.kernels.model_residual_wp import residual_tables
 
@@ -117,7 +117,15 @@ class ModelResidual(torch.nn.Module):
         if activations is None or scale is None:
             assert self.activation_count == 0, self.activation_count
             activations, scale = targets.new_empty(len(targets), 0), targets.new_ones(len(targets))
+        count, vertices = targets.shape[:2]
+        assert activations.shape == (count, self.activation_count), activations.shape
+        assert transforms.shape[1] >= self.joint_count, transforms.shape
+        assert rest.shape[1:] == (vertices, 3) == (self.vertex_count, 3), rest.shape
+        sizes = {"transforms": len(transforms), "scale": len(scale), "origin": len(origin)}
+        assert set(sizes.values()) == {count}, sizes
+        assert {len(rest), len(weights)} <= {1, count}, (len(rest), len(weights))
         given = rest, weights, transforms, activations, scale, targets, origin, bound
+        assert {one.dtype for one in given if one is not None} == {self.dtype}, self.dtype
         if self.warp:
             from soma_core.kernels.model_residual_wp import residual_sums
 
