@@ -37,6 +37,9 @@ class Correctives(torch.nn.Module):
         rig: of the level of detail that comes out.
         outputs: (3 v, 3 V) from offsets of the mid LOD to those of the vertices that come out.
         dtype, device: of constants and results.
+
+    Attributes:
+        owner: (activations,) joint that each activation belongs to.
     """
 
     def __init__(
@@ -55,6 +58,7 @@ class Correctives(torch.nn.Module):
         used = np.flatnonzero(np.diff(second.indptr))  # activations that move anything
         self.first = SparseRows(weights.first.T.tocsr()[used], dtype=dtype, device=device)
         self.second = SparseRows(second[:, used].tocsr(), dtype=dtype, device=device)
+        self.owner = used // weights.channels
         self._rig = rig
         self.length = float(skeleton_length(torch.as_tensor(rig.bind_world.copy())[None], rig))
 

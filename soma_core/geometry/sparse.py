@@ -84,3 +84,7 @@ class SparseRows(torch.nn.Module):
     def forward(self, dense: Tensor) -> Tensor:
         """Product with (n, f); (m, f)."""
         return gather_rows(dense, self.csr, self.transpose)
+
+    def pull_back(self, rows: Tensor) -> Tensor:
+        """Product of (f, m) with the matrix, (f, n); no derivative."""
+        return sparse_product(self.transpose, rows.T.contiguous()).T

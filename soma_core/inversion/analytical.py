@@ -152,7 +152,7 @@ class Analytical(torch.nn.Module):
         second: Tensor,
     ) -> Pose:
         """Turn each level's joints to their optimum; `second` is the dense ``N``."""
-        turns, places = self.solver.walk(pose, rest.offsets)
+        turns, places = self.solver.walk(pose, rest)
         residual = self.solver.gradient(turns, places, second, target)
         # A joint's own moments, in its own axes, change only when joints below it are turned.
         spread = self._spread(pose.relative, turns, places, rest)

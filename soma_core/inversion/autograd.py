@@ -179,7 +179,7 @@ class Autograd(torch.nn.Module):
         """Mean squared distance [m^2] beyond that of the start, exact for any step."""
         solver, rest, joints = self.solver, problem.rest, self.joints
         second, mass = solver.dense(rest.second), rest.own[..., 3, 3].sum(1)
-        turns, places = solver.walk(start, rest.offsets)
+        turns, places = solver.walk(start, rest)
         residual = solver.gradient(turns, places, second, problem.target)
 
         def loss(turned: Tensor, shift: Tensor) -> Tensor:

@@ -7,6 +7,7 @@ parents), the translation last; fill then stays on chains towards the root.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -21,6 +22,7 @@ class EliminationPlan:
     """Lists of int32; ``*_start`` are row starts. A column is a variable joint, in descending order.
 
     Attributes:
+        driven: how many columns, the first ones, are those of driven joints.
         joint: (n,) joint of each column.
         parent: (n,) parent joint of each column's joint.
         parent_column: (n,) column of that parent, -1 for the topmost joints.
@@ -35,6 +37,7 @@ class EliminationPlan:
             of block (b, a), which elimination lowers by ``L_b L_a^T``.
     """
 
+    driven: int
     joint: np.ndarray
     parent: np.ndarray
     parent_column: np.ndarray
@@ -55,28 +58,41 @@ class EliminationPlan:
     update_target: np.ndarray
 
 
-def elimination_plan(structure: MomentStructure) -> EliminationPlan:
-    """Symbolic assembly and factorisation for one rig."""
+def elimination_plan(
+    structure: MomentStructure, *, public_count: int | None = None, coupled: Iterable[tuple[int, int]] = ()
+) -> EliminationPlan:
+    """Symbolic assembly and factorisation for one rig.
+
+    Args:
+        structure: joints, driven ones last.
+        public_count: joints that are not driven; None for all. Columns of driven joints come first, are
+            handed to their parent and are not eliminated.
+        coupled: further pairs of variable joints that share a block.
+    """
+    public_count = len(structure.parents) if public_count is None else public_count
     columns = structure.variables[::-1]
+    driven = int((columns >= public_count).sum())
     column_of = np.full(len(structure.parents), -1)
     column_of[columns] = np.arange(len(columns))
     near = _neighbours(structure)
     above = structure.ancestors
     reach = {u: np.flatnonzero(above[:, [t for t, _, _ in near[u]]].any(1))[::-1] for u in columns}
-    filled, pattern = _fill(structure, columns, reach)
-    block_rows = [k + np.flatnonzero(filled[k:, k]) for k in range(len(columns))]
+    last = [int(u if k >= driven else structure.parents[u]) for k, u in enumerate(columns)]
+    filled, pattern = _fill(structure, columns, reach, last, driven, coupled)
+    block_rows = [k + np.flatnonzero((filled if k >= driven else pattern)[k:, k]) for k in range(len(columns))]
     start = _starts(block_rows)
     slot = {(int(r), k): start[k] + i for k, rows in enumerate(block_rows) for i, r in enumerate(rows)}
     row_slots = [
-        [slot[column_of[i], k] if 0 < i <= u else -1 for i in reach[u]] for k, u in enumerate(columns)
+        [slot[column_of[i], k] if 0 < i <= last[k] else -1 for i in reach[u]] for k, u in enumerate(columns)
     ]
     pushes = [_pushes(k, structure, columns, column_of, pattern, slot) for k in range(len(columns))]
     updates = [
-        [slot[int(b), int(a)] for i, a in enumerate(rows[1:]) for b in rows[1 + i :]] for rows in block_rows
+        [slot[int(b), int(a)] for i, a in enumerate(rows[1:]) for b in rows[1 + i :]] if k >= driven else []
+        for k, rows in enumerate(block_rows)
     ]
     parent = structure.parents[columns]
     return EliminationPlan(
-        joint=_ints(columns), parent=_ints(parent), parent_column=_ints(column_of[parent]),
+        driven=driven, joint=_ints(columns), parent=_ints(parent), parent_column=_ints(column_of[parent]),
         near_start=_ints(_starts([near[u] for u in columns])),
         near_joint=_ints([t for u in columns for t, _, _ in near[u]]),
         near_pair=_ints([p for u in columns for _, p, _ in near[u]]),
@@ -105,19 +121,28 @@ def _neighbours(structure: MomentStructure) -> dict[int, list[tuple[int, int, in
 
 
 def _fill(
-    structure: MomentStructure, columns: np.ndarray, reach: dict[int, np.ndarray]
+    structure: MomentStructure,
+    columns: np.ndarray,
+    reach: dict[int, np.ndarray],
+    last: list[int],
+    driven: int,
+    coupled: Iterable[tuple[int, int]],
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Blocks of the factor, and of the matrix, (n, n) lower triangular in elimination order."""
+    """Blocks of the factor, and of the sums up the tree, (n, n) lower triangular in elimination order."""
     pattern = np.zeros((len(columns), len(columns)), bool)
     column_of = {int(u): k for k, u in enumerate(columns)}
     for k, u in enumerate(columns):
-        pattern[[column_of[int(i)] for i in reach[u] if 0 < i <= u], k] = True
-        pattern[k, k] = True
+        pattern[[column_of[int(i)] for i in reach[u] if 0 < i <= last[k]], k] = True
+        pattern[k, k] = k >= driven
         above = column_of.get(int(structure.parents[u]))
         if above is not None:
             pattern[above:, above] |= pattern[above:, k]
     filled = pattern.copy()
-    for k in range(len(columns)):
+    filled[:, :driven] = False
+    for first, second in coupled:
+        a, b = sorted((column_of[first], column_of[second]))
+        filled[b, a] = True
+    for k in range(driven, len(columns)):
         rows = k + 1 + np.flatnonzero(filled[k + 1 :, k])
         for i, a in enumerate(rows):
             filled[rows[i:], a] = True

@@ -8,7 +8,9 @@ rule), which keeps float32 accurate at the fingertips.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -16,22 +18,28 @@ from torch import Tensor
 
 from soma_core.animation.kinematics import joint_levels
 from soma_core.geometry.rotations import cayley, skew
-from soma_core.inversion.elimination import elimination_plan
+from soma_core.inversion.driven import DrivenJoints
 from soma_core.inversion.moments import RestMoments
 from soma_core.inversion.priors import JointTerms
 from soma_core.inversion.problem import Pose
 from soma_core.inversion.structure import MomentStructure
 
-__all__ = ["GaussNewton"]
+if TYPE_CHECKING:
+    from soma_core.kernels.pose_solver_wp import PoseSolver, Soft
+
+__all__ = ["HINGE_STIFFNESS", "GaussNewton", "damped_inverse"]
 
 _START_DAMPING = 1e-4
 _LOWER, _RAISE, _MOST_DAMPING = 0.2, 8.0, 1e6
 """Levenberg damping, relative to the diagonal: start, factors after a good and a bad step, largest value."""
 
+_LEAST_DAMPING = 1e-6
+"""Of a rig with driven joints: how a limb's twist is shared between its two ends is left open by its skin."""
+
 _RIDGE = 1e-9
 """Relative to the mean diagonal: keeps the factorisation defined where a joint moves nothing."""
 
-_HINGE = 1e3
+HINGE_STIFFNESS = 1e3
 """Stiffness of a hinge across its axis, relative to what the vertices have to say of the joint."""
 
 _LONGEST_STEP = 1.0
@@ -42,9 +50,14 @@ class GaussNewton(torch.nn.Module):
     """Minimises the skinning error over the rotations of one rig and the Hips position.
 
     Args:
-        structure: which joints share vertices.
+        structure: which joints share vertices; with `driven`, of the rig that has the helpers as joints.
         dtype, device: of the state; float32 reaches 1e-4 mm on a body near the origin.
         warp: run the Warp twin instead of the torch reference.
+        driven: joints whose turn follows from the others'; a pose does not hold them.
+
+    Attributes:
+        variables: (n,) joints that a step turns.
+        joints: (T,) joints that carry weight, driven ones included.
     """
 
     def __init__(
@@ -54,25 +67,31 @@ class GaussNewton(torch.nn.Module):
         dtype: torch.dtype,
         device: torch.device | str,
         warp: bool = False,
+        driven: DrivenJoints | None = None,
     ) -> None:
         super().__init__()
-        self.plan = _warp_plan(structure, torch.device(device)) if warp else None
+        self.driven = driven
         self.joint_count = len(structure.parents)
+        self.public_count = self.joint_count if driven is None else driven.public_count
+        self.kernels = _kernels(structure, driven, dtype, torch.device(device)) if warp else None
         self.level_count = 0
 
         def keep(name: str, array: np.ndarray) -> None:
             self.register_buffer(name, torch.as_tensor(array, device=device), persistent=False)
 
         keep("joints", structure.joints)
-        keep("variables", structure.variables)
+        keep("movable", structure.variables)
+        keep("variables", structure.variables[structure.variables < self.public_count])
         keep("parents", np.maximum(structure.parents, 0))
         first, second = structure.pairs.T
         both = first != second
+        keep("above", structure.ancestors[structure.variables][:, structure.joints])
         keep("pair_first", first)
         keep("pair_second", second)
         keep("pair_both", np.flatnonzero(both))
         for index, level in enumerate(joint_levels(structure.parents)):
             keep(f"level_{index}", level)
+            keep(f"public_{index}", level[level < self.public_count])
             self.level_count = index + 1
         self.register_buffer("eye", torch.eye(3, dtype=dtype, device=device), persistent=False)
 
@@ -85,6 +104,7 @@ class GaussNewton(torch.nn.Module):
         iterations: int,
         tolerance: float = 0.0,
         terms: JointTerms | None = None,
+        residual: Tensor | None = None,
     ) -> Pose:
         """Refine `start`; never worse than it.
 
@@ -95,25 +115,31 @@ class GaussNewton(torch.nn.Module):
             iterations: number of steps tried; a step that would raise the energy is undone and damped.
             tolerance: a frame rests once a step changed its energy by less, as a root mean square [m].
             terms: soft terms on single joints, and hinges; `start` must keep the hinges.
+            residual: ``P`` (F, T, 3, 4) at `start`, in place of that of `target`: what another model than
+                skinning leaves there.
         """
-        if self.plan is not None and iterations:
-            return self._by_warp(target, rest, start, iterations, tolerance, terms)
+        if self.kernels is not None and iterations:
+            given = target if residual is None else residual
+            return self._by_warp(given, rest, start, iterations, tolerance, terms, forced=residual is not None)
+        if residual is not None:
+            turns, places = self.walk(start, rest)
+            target = self.times_second(self.transforms(turns, places), self.dense(rest.second)) - residual
         second = self.dense(rest.second)
         pose = start
-        turns, places = self.walk(pose, rest.offsets)
+        turns, places = self.walk(pose, rest)
         residual = self.gradient(turns, places, second, target)
         mass = rest.own[..., 3, 3].sum(1)
         damping = torch.full_like(pose.last_change, _START_DAMPING)
         moving = torch.ones_like(pose.last_change, dtype=torch.bool)
         for _ in range(iterations):
-            matrix, slope = self.normal_equations(turns, places, rest.second, residual)
+            matrix, slope = self.normal_equations(turns, places, rest, residual)
             if terms is not None:
                 self.add_terms(matrix, slope, pose.relative, turns, terms, mass)
             step = self.damped_step(matrix, slope, damping)
             if terms is not None:
                 step = self._along_hinges(step, turns, terms)
             trial = self.retract(pose, turns, step)
-            trial_turns, trial_places = self.walk(trial, rest.offsets)
+            trial_turns, trial_places = self.walk(trial, rest)
             change = torch.cat((trial_turns - turns, (trial_places - places)[..., None]), -1)[:, self.joints]
             product = self.times_second(change, second)
             energy = (change * (product + 2 * residual)).sum((1, 2, 3))
@@ -135,6 +161,7 @@ class GaussNewton(torch.nn.Module):
             places = torch.where(keep[..., 0], trial_places, places)
             residual = torch.where(keep, residual + product, residual)
             damping = (damping * torch.where(better, _LOWER, _RAISE).to(damping)).clamp_max(_MOST_DAMPING)
+            damping = damping.clamp_min(self._least_damping)
         return pose
 
     def add_terms(
@@ -149,7 +176,7 @@ class GaussNewton(torch.nn.Module):
         own = matrix[:, each, :, each] + (mass[:, None, None, None] * blocks).transpose(0, 1)
         axis = (above @ terms.hinge_axis[..., None]).squeeze(-1).transpose(0, 1)
         hinge = (terms.hinge_axis != 0).any(-1)[:, None]
-        stiff = hinge * _HINGE * own.diagonal(dim1=-2, dim2=-1).sum(-1)
+        stiff = hinge * HINGE_STIFFNESS * own.diagonal(dim1=-2, dim2=-1).sum(-1)
         across = self.eye - axis[..., :, None] * axis[..., None, :]
         matrix[:, each, :, each] = own + stiff[..., None, None] * across
         slope[:, : len(n)] += mass[:, None, None] * slopes
@@ -169,21 +196,45 @@ class GaussNewton(torch.nn.Module):
         iterations: int,
         tolerance: float,
         terms: JointTerms | None,
+        *,
+        forced: bool,
     ) -> Pose:
-        from soma_core.kernels.gauss_newton_wp import gauss_newton
-
-        mass = rest.own[..., 3, 3].sum(1)
-        relative, translation, accepted, energy = gauss_newton(
-            self.plan, target, rest.second, rest.offsets, start.relative, start.translation,
-            (tolerance**2 * mass).expand(len(target)), iterations=iterations,
-            damping=(_START_DAMPING, _LOWER, _RAISE, _MOST_DAMPING), longest=_LONGEST_STEP, hinge=_HINGE,
-            terms=None if terms is None else (vars(terms), mass.expand(len(target))),
+        assert self.kernels is not None
+        mass = rest.own[..., 3, 3].sum(1).expand(len(target))
+        relative, translation, accepted, energy = self.kernels.fit(
+            self.constants(rest), target, start.relative, start.translation, tolerance**2 * mass, mass,
+            forced=forced, iterations=iterations,
+            damping=(_START_DAMPING, _LOWER, _RAISE, self._least_damping, _MOST_DAMPING), longest=_LONGEST_STEP,
+            stiffness=HINGE_STIFFNESS, soft=self.soft(terms, target),
         )  # fmt: skip
         return Pose(
             relative=relative,
             translation=translation,
             accepted=start.accepted + accepted.to(start.accepted),
             last_change=(energy.abs() / mass).sqrt(),
+        )
+
+    def constants(self, rest: RestMoments) -> tuple[Tensor, bool]:
+        """What kernels take of identities."""
+        assert self.kernels is not None
+        driven = () if rest.driven is None else (rest.driven.left, rest.driven.right, rest.driven.axis)
+        return self.kernels.constants(rest.second, rest.offsets, *driven)
+
+    def soft(self, terms: JointTerms | None, like: Tensor) -> Soft:
+        """Terms as kernels take them: by columns, which are the movable joints in descending order."""
+        from soma_core.kernels.pose_solver_wp import Soft
+
+        count, whole = len(self.variables), len(self.movable)
+        none = like.new_zeros(0)
+        if terms is None:
+            index = torch.zeros(0, dtype=torch.int32, device=like.device)
+            return Soft(index, like.new_zeros(1), none, hinged=False)
+        hinges = torch.nn.functional.pad(terms.hinge_axis.flip(0), (0, 0, whole - count, 0))
+        return Soft(
+            columns=(whole - 1 - terms.variable).to(torch.int32),
+            numbers=torch.cat((terms.stiffness, terms.free, hinges.flatten())).contiguous(),
+            reference=terms.reference.expand(len(like), -1, 3, 3),
+            hinged=bool((terms.hinge_axis != 0).any()),
         )
 
     def dense(self, second: Tensor) -> Tensor:
@@ -194,12 +245,31 @@ class GaussNewton(torch.nn.Module):
         full[:, self.pair_first, :, self.pair_second] = second.transpose(0, 1)
         return full.flatten(3, 4).flatten(1, 2)
 
-    def walk(self, pose: Pose, offsets: Tensor) -> tuple[Tensor, Tensor]:
-        """Accumulated turns (F, J, 3, 3) and joint positions (F, J, 3) [m]."""
+    @property
+    def _least_damping(self) -> float:
+        return 0.0 if self.driven is None else _LEAST_DAMPING
+
+    def walk(self, pose: Pose, rest: RestMoments) -> tuple[Tensor, Tensor]:
+        """Accumulated turns (F, J, 3, 3) and joint positions (F, J, 3) [m], of driven joints too."""
+        turns, places = self._walk_public(pose, rest.offsets)
+        if self.driven is None:
+            return turns, places
+        assert rest.driven is not None
+        start, offsets = self.driven.start, rest.offsets[:, self.public_count :]
+        spins, _ = self.driven.spins(turns, rest.driven)
+        above = turns[:, start]
+        step = (above @ offsets[..., None]).squeeze(-1)
+        return torch.cat((turns, above @ spins), 1), torch.cat((places, places[:, start] + step), 1)
+
+    def transforms(self, turns: Tensor, places: Tensor) -> Tensor:
+        """``[D_t | c_t]`` (F, T, 3, 4) of the weighted joints."""
+        return torch.cat((turns, places[..., None]), -1)[:, self.joints]
+
+    def _walk_public(self, pose: Pose, offsets: Tensor) -> tuple[Tensor, Tensor]:
         turns = pose.relative.clone()
         places = torch.zeros_like(pose.relative[..., 0])
         for index in range(self.level_count):
-            level = getattr(self, f"level_{index}")
+            level = getattr(self, f"public_{index}")
             above = self.parents[level]
             turns[:, level] = turns[:, above] @ pose.relative[:, level]
             if index == 0:
@@ -226,15 +296,47 @@ class GaussNewton(torch.nn.Module):
 
     def gradient(self, turns: Tensor, places: Tensor, second: Tensor, target: Tensor) -> Tensor:
         """``P = G N - R`` (F, T, 3, 4), half the derivative of the energy by the joint transforms."""
-        transforms = torch.cat((turns, places[..., None]), -1)[:, self.joints]
-        return self.times_second(transforms, second) - target
+        return self.times_second(self.transforms(turns, places), second) - target
 
     def normal_equations(
-        self, turns: Tensor, places: Tensor, second: Tensor, residual: Tensor
+        self, turns: Tensor, places: Tensor, rest: RestMoments, residual: Tensor | None = None
     ) -> tuple[Tensor, Tensor]:
-        """``J^T J`` (F, n + 1, 3, n + 1, 3) and ``J^T r`` (F, n + 1, 3), the translation last."""
+        """``J^T J`` (F, n + 1, 3, n + 1, 3) and ``J^T r`` (F, n + 1, 3), the translation last.
+
+        Args:
+            turns, places: of all joints, from :meth:`walk`.
+            rest: of the identities.
+            residual: ``P`` (F, T, 3, 4); None for zero.
+        """
+        if residual is None:
+            residual = turns.new_zeros(len(turns), len(self.joints), 3, 4)
+        matrix = self._free_matrix(turns, places, rest.second)
+        slope = self._free_slopes(turns, places, residual)
+        if self.driven is None:
+            return matrix, slope
+        fold = self.fold(turns, rest)
+        once = self.folded(matrix.permute(0, 3, 4, 1, 2), fold)  # columns on the variables
+        return self.folded(once.permute(0, 3, 4, 1, 2), fold), self.folded(slope, fold)
+
+    def fold(self, turns: Tensor, rest: RestMoments) -> Tensor:
+        """How the variables turn the driven joints that move skin, (F, h, 3, n, 3)."""
+        assert self.driven is not None and rest.driven is not None
+        _, slope = self.driven.read(turns, rest.driven)
+        columns = self.driven.columns(turns, slope, self.variables)
+        return columns[:, self.movable[len(self.variables) :] - self.public_count]
+
+    def folded(self, rows: Tensor, fold: Tensor) -> Tensor:
+        """Rows (F, N + 1, 3, ...) by all movable joints onto the variables, (F, n + 1, 3, ...)."""
+        n = len(self.variables)
+        own, driven, last = rows[:, :n], rows[:, n:-1], rows[:, -1:]
+        flat = driven.flatten(3) if driven.ndim > 3 else driven[..., None]
+        moved = torch.einsum("fhanb,fhac->fnbc", fold, flat).reshape(own.shape)
+        return torch.cat((own + moved, last), 1)
+
+    def _free_matrix(self, turns: Tensor, places: Tensor, second: Tensor) -> Tensor:
+        """``J^T J`` (F, N + 1, 3, N + 1, 3) as if driven joints turned freely."""
         moments = self._subtree_moments(turns, places, second)
-        n = self.variables
+        n = self.movable
         block = moments[:, n][:, :, n]
         spread = block[..., :3, :3]
         trace = spread.diagonal(dim1=-2, dim2=-1).sum(-1)
@@ -246,10 +348,14 @@ class GaussNewton(torch.nn.Module):
         matrix[:, :count, :, count] = lever
         matrix[:, count, :, :count] = lever.permute(0, 3, 1, 2)
         matrix[:, count, :, count] = moments[:, 0, 0, 3, 3][:, None, None] * self.eye
-        return matrix, self.slopes(turns, places, residual)
+        return matrix
 
-    def slopes(self, turns: Tensor, places: Tensor, residual: Tensor) -> Tensor:
+    def slopes(self, turns: Tensor, places: Tensor, rest: RestMoments, residual: Tensor) -> Tensor:
         """``J^T r`` (F, n + 1, 3) of the moments (F, T, 3, 4) of residuals, the translation last."""
+        slope = self._free_slopes(turns, places, residual)
+        return slope if self.driven is None else self.folded(slope, self.fold(turns, rest))
+
+    def _free_slopes(self, turns: Tensor, places: Tensor, residual: Tensor) -> Tensor:
         spread, force = self.subtree_forces(turns, places, residual)
         torque = torch.stack(
             (
@@ -259,7 +365,7 @@ class GaussNewton(torch.nn.Module):
             ),
             -1,
         )
-        return torch.cat((torque[:, self.variables], force[:, :1]), 1)
+        return torch.cat((torque[:, self.movable], force[:, :1]), 1)
 
     def _subtree_moments(self, turns: Tensor, places: Tensor, second: Tensor) -> Tensor:
         """``H_ij`` (F, J, J, 4, 4): second moments of subtree i against subtree j about their joints."""
@@ -311,15 +417,16 @@ class GaussNewton(torch.nn.Module):
 
     def damped_step(self, matrix: Tensor, slope: Tensor, damping: Tensor) -> Tensor:
         """Damped step (F, n + 1, 3); Cholesky only, and no error check, so nothing waits for the device."""
-        matrix, flat = matrix.flatten(3, 4).flatten(1, 2), slope.flatten(1)
-        diagonal = matrix.diagonal(dim1=-2, dim2=-1)
-        extra = damping[:, None] * diagonal + _RIDGE * diagonal.mean(1, keepdim=True)
-        factor, _ = torch.linalg.cholesky_ex(matrix + torch.diag_embed(extra))
-        step = -torch.cholesky_solve(flat[..., None], factor).squeeze(-1)
-        step = step.view_as(slope)
+        return self.shortened(-damped_inverse(matrix, damping)(slope))
+
+    def shortened(
+        self, step: Tensor, turns: Tensor | None = None, terms: JointTerms | None = None
+    ) -> Tensor:
+        """The step with no joint turned too far at once, and hinges kept to their axis where `terms` are given."""
         length = step[:, :-1].norm(dim=-1, keepdim=True)
         short = torch.clamp(_LONGEST_STEP / length.clamp_min(1e-12), max=1)
-        return torch.cat((step[:, :-1] * short, step[:, -1:]), 1)
+        step = torch.cat((step[:, :-1] * short, step[:, -1:]), 1)
+        return step if terms is None or turns is None else self._along_hinges(step, turns, terms)
 
     def retract(self, pose: Pose, turns: Tensor, step: Tensor) -> Pose:
         """Turn every variable joint by its step, in the axes of its parent, and remove rounding."""
@@ -331,12 +438,23 @@ class GaussNewton(torch.nn.Module):
         return replace(pose, relative=relative, translation=pose.translation + step[:, -1])
 
 
-def _warp_plan(structure: MomentStructure, device: torch.device):
-    from soma_core.kernels.gauss_newton_wp import GaussNewtonPlan
+def damped_inverse(matrix: Tensor, damping: Tensor) -> Callable[[Tensor], Tensor]:
+    """Solves for slopes (F, n + 1, 3) with a matrix (F, n + 1, 3, n + 1, 3), damped relative to its diagonal."""
+    dense = matrix.flatten(3, 4).flatten(1, 2)
+    diagonal = dense.diagonal(dim1=-2, dim2=-1)
+    extra = damping[:, None] * diagonal + _RIDGE * diagonal.mean(1, keepdim=True)
+    factor, _ = torch.linalg.cholesky_ex(dense + torch.diag_embed(extra))
+    return lambda slope: torch.cholesky_solve(slope.flatten(1)[..., None], factor).view_as(slope)
 
-    tree = {
-        "parents": structure.parents,
-        "weighted": structure.joints,
-        "pairs": structure.pairs.ravel(),
-    }
-    return GaussNewtonPlan({**vars(elimination_plan(structure)), **tree}, device)
+
+def _kernels(
+    structure: MomentStructure, driven: DrivenJoints | None, dtype: torch.dtype, device: torch.device
+) -> PoseSolver | None:
+    """Kernels of a rig; none where twist is read by Euler angles, which they do not know."""
+    if driven is not None and not driven.turning:
+        return None
+    from soma_core.inversion.tables import solver_tables
+    from soma_core.kernels.pose_solver_wp import PoseSolver
+
+    tables = solver_tables(structure, driven)
+    return PoseSolver(tables.counts, tables.lists, tables.numbers, dtype=dtype, device=device)

@@ -98,7 +98,7 @@ def _pull_back(
     eye = solver.eye.expand(len(rotations), 1, 3, 3)
     relative = torch.cat((eye, rotations), 1)
     # The matrix does not depend on where the body stands; near the origin it is most precise.
-    turns, places = solver.walk(Pose.begin(relative, torch.zeros_like(translation)), rest.offsets)
+    turns, places = solver.walk(Pose.begin(relative, torch.zeros_like(translation)), rest)
     n = solver.variables
     above = turns[:, solver.parents[n]]
     zero = torch.zeros(len(rotations), len(moments.joints), 3, 4).to(rotations)

@@ -11,7 +11,7 @@ from soma_core.inversion.moments import RestMoments
 from soma_core.inversion.priors import JointTerms
 from soma_core.skeleton.identity import Identity
 
-__all__ = ["Pose", "Problem"]
+__all__ = ["Activity", "Pose", "Problem", "View"]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -66,3 +66,40 @@ class Pose:
             accepted=torch.zeros(count, dtype=torch.int64, device=device),
             last_change=torch.full((count,), torch.inf, dtype=relative.dtype, device=device),
         )
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Activity:
+    """Activations of poses.
+
+    Attributes:
+        value: (F, C).
+        before: what goes into each activation, (F, C); None where that is its value.
+        slope: derivative (F, C) by it; None likewise.
+    """
+
+    value: Tensor
+    before: Tensor | None = None
+    slope: Tensor | None = None
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class View:
+    """A pose under the whole model.
+
+    Attributes:
+        energy: (F,) [m^2].
+        slope: half its derivative (F, n + 1, 3) by turns in world axes, and by the translation.
+        residual: ``P`` (F, T, 3, 4), moments of what is left.
+        pull: half the derivative (F, C) by the activations; None without offsets.
+        turns, places: of all joints, (F, J, 3, 3) and (F, J, 3).
+        activity: of the offsets; None without.
+    """
+
+    energy: Tensor
+    slope: Tensor
+    residual: Tensor
+    pull: Tensor | None
+    turns: Tensor
+    places: Tensor
+    activity: Activity | None

@@ -75,7 +75,7 @@ def _followed(
     """``L^-1 J^T D`` (n, k) of displacement fields D (k, v, 3) of a frame, ``L L^T = J^T J`` of its pose."""
     solver, moments = inversion.ladder.solver, inversion.moments
     eye = solver.eye.expand(1, 1, 3, 3)
-    turns, places = solver.walk(Pose.begin(torch.cat((eye, turn), 1), place), rest.offsets)
+    turns, places = solver.walk(Pose.begin(torch.cat((eye, turn), 1), place), rest)
     none = torch.zeros_like(rest.own[..., :3, :])
     matrix, _ = solver.normal_equations(turns, places, rest.second, none)
     dense = matrix.flatten(3, 4).flatten(1, 2)[0].double()

@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 
 from soma_core.geometry.kabsch import rotation_from_covariance
+from soma_core.inversion.limbs import LimbStart
 from soma_core.inversion.moments import RestMoments
 from soma_core.inversion.structure import MomentStructure
 
@@ -21,13 +22,28 @@ class ProcrustesStart(torch.nn.Module):
 
     Args:
         structure: joints, and which of them carry weight.
+        public_count: how many of the joints a pose has, the first ones; None for all.
+        limbs: what turns the joints that twist joints hang on; None without such.
+        warp: align by the Warp twin where no derivative is asked for; None, on a CPU.
     """
 
-    def __init__(self, structure: MomentStructure, *, dtype: torch.dtype, device: torch.device | str) -> None:
+    def __init__(
+        self,
+        structure: MomentStructure,
+        *,
+        dtype: torch.dtype,
+        device: torch.device | str,
+        public_count: int | None = None,
+        limbs: LimbStart | None = None,
+        warp: bool | None = None,
+    ) -> None:
         super().__init__()
-        parents = np.maximum(structure.parents, 0)
+        self.warp = torch.device(device).type == "cpu" if warp is None else warp
+        self.limbs = limbs
+        parents = np.maximum(structure.parents[:public_count], 0)
         source = np.full(len(parents), len(structure.joints))  # the root: identity, appended last
-        source[structure.joints] = np.arange(len(structure.joints))
+        own = structure.joints < len(parents)
+        source[structure.joints[own]] = np.flatnonzero(own)
         for joint in range(1, len(parents)):
             if source[joint] == len(structure.joints):
                 source[joint] = source[parents[joint]]
@@ -37,11 +53,21 @@ class ProcrustesStart(torch.nn.Module):
 
     def forward(self, target: Tensor, rest: RestMoments) -> Tensor:
         """T-pose-relative rotations (F, J, 3, 3) from ``R`` (F, T, 3, 4)."""
-        turns = rotation_from_covariance(_covariance(target, rest.own[..., 3, :]))
+        turns = self._nearest(_covariance(target, rest.own[..., 3, :]))
         eye = self.eye.expand(len(turns), 1, 3, 3)
+        limbs = None if self.limbs is None else self.limbs(turns, rest.own[..., 3, 3])
         turns = torch.cat((turns, eye), 1)[:, self.source]
+        if self.limbs is not None and limbs is not None:
+            turns = turns.index_copy(1, self.limbs.starts, limbs)
         relative = turns[:, self.parents].transpose(-1, -2) @ turns
         return torch.cat((eye, relative[:, 1:]), 1)
+
+    def _nearest(self, covariance: Tensor) -> Tensor:
+        if not self.warp or (torch.is_grad_enabled() and covariance.requires_grad):
+            return rotation_from_covariance(covariance)
+        from soma_core.kernels.nearest_rotation_wp import nearest_rotation
+
+        return nearest_rotation(covariance)
 
 
 def best_translation(target: Tensor, rest: RestMoments, turns: Tensor, places: Tensor) -> Tensor:

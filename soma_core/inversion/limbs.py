@@ -1,0 +1,241 @@
+"""Upper arms and thighs: where their fit begins, and how their twist is shared with the forearm or shin.
+
+Twist joints carry all skin of an upper arm or a thigh. They undo the twist of the bone itself at its upper end
+and take on that of the next bone at its lower end. So a turn of the upper arm about its own axis, undone at
+the elbow, leaves a straight arm's skin where it is: only what correctives add tells it, by little and not by a
+parabola. The start therefore reads the twist along the bone from the clouds of the helpers, and a search looks at
+every share of it.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from soma_core.geometry.kabsch import rotation_from_covariance
+from soma_core.geometry.rotations import axis_angle_to_matrix
+from soma_core.inversion.driven import DrivenJoints, half_angle
+from soma_core.inversion.moments import RestMoments
+from soma_core.inversion.offsets import PoseOffsets
+from soma_core.inversion.problem import Pose, View
+from soma_core.rig.skeleton import Rig
+
+__all__ = ["LimbStart", "TwistShare"]
+
+_INNER = (0.2, 0.8)
+"""Helpers whose share of the end's twist lies between these: their skin hardly blends with other bones."""
+
+_MARGIN = 0.05
+"""Distance kept from half a turn, where a twist angle jumps [rad]."""
+
+_SHARES = 25
+"""Shares looked at, evenly over a whole turn."""
+
+
+class LimbStart(torch.nn.Module):
+    """Turns of the joints that helpers hang on, from the clouds of the helpers.
+
+    Args:
+        rig: the public joints, with `procedural`.
+        driven: its helpers.
+        joints: (T,) weighted joints, helpers among them.
+    """
+
+    def __init__(self, rig: Rig, driven: DrivenJoints, joints: np.ndarray) -> None:
+        super().__init__()
+        assert rig.procedural is not None
+        names = (*rig.joint_names, *rig.procedural.joint_names)
+        row = {int(joint): index for index, joint in enumerate(joints)}
+        mix = driven.mix.double().cpu().numpy()
+        channel = driven.joint.tolist()
+        starts, halves, clouds, shares, axes = [], [], [], [], []
+        for segment in rig.procedural.definition.segments:
+            own, end = names.index(segment.start), names.index(segment.end)
+            helpers = [names.index(name) for name in segment.helpers]
+            if len(helpers) < 2 or end not in channel or not all(helper in row for helper in helpers):
+                continue
+            share = mix[[helper - rig.joint_count for helper in helpers], channel.index(end)]
+            if np.ptp(share) < 0.1:
+                continue
+            starts.append(own)
+            halves.append(0.5 if segment.reverse else 0.0)
+            clouds.append([row[helper] for helper in helpers])
+            shares.append(share.tolist())
+            axes.append(driven.spin_axis[helpers[0] - rig.joint_count].double().cpu().numpy())
+        width = max(map(len, clouds), default=0)
+        padded = [one + [one[-1]] * (width - len(one)) for one in clouds]
+        counted = np.array([[k < len(one) for k in range(width)] for one in clouds])
+        share = np.array([one + [one[-1]] * (width - len(one)) for one in shares])
+        inner = counted & (share > _INNER[0]) & (share < _INNER[1])
+        inner = np.where(inner.any(1, keepdims=True), inner, counted)
+        centred = np.where(counted, share - (share * counted).sum(1, keepdims=True) / counted.sum(1, keepdims=True), 0)
+        kind = driven.mix
+
+        def keep(name: str, array: np.ndarray) -> None:
+            tensor = torch.as_tensor(np.array(array), device=kind.device)
+            tensor = tensor.to(kind.dtype) if tensor.is_floating_point() else tensor
+            self.register_buffer(name, tensor, persistent=False)
+
+        keep("starts", np.array(starts, np.int64))
+        keep("clouds", np.array(padded, np.int64).reshape(len(starts), width))
+        keep("inner", inner.astype(np.float64).reshape(len(starts), width))
+        keep("centre", np.array(halves, np.float64))
+        keep("share", share.reshape(len(starts), width))
+        keep("regress", centred / (centred**2).sum(1, keepdims=True).clip(1e-12) if len(starts) else centred)
+        keep("axis", np.array(axes).reshape(-1, 3))
+
+    def forward(self, turns: Tensor, mass: Tensor) -> Tensor:
+        """World turns (F, L, 3, 3) of the joints `starts`.
+
+        Args:
+            turns: of each weighted joint's own cloud, (F, T, 3, 3).
+            mass: of the clouds, (1 or F, T).
+        """
+        own = turns[:, self.clouds]
+        steps = half_angle(own[:, :, :-1].mT @ own[:, :, 1:], self.axis[:, None])[0].cumsum(-1)
+        along = torch.nn.functional.pad(steps, (1, 0))
+        most = math.pi * (1 + 2 * self.centre) - _MARGIN
+        total = (along * self.regress).sum(-1)
+        total = torch.maximum(torch.minimum(total, most), -most)
+        spin = (self.share - self.centre[:, None]) * total[..., None]
+        back = axis_angle_to_matrix(-spin[..., None] * self.axis[:, None])
+        weight = self.inner * mass[:, self.clouds]
+        return rotation_from_covariance((weight[..., None, None] * (own @ back)).sum(2))
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Limb:
+    """One limb whose twist can be shared in many ways.
+
+    Attributes:
+        own, end: the joint that helpers undo, and the next.
+        channels: of the two.
+        helpers: (h,) positions among the helpers.
+        clouds: (h,) positions of the helpers among the weighted joints.
+        pairs: (q,) pairs of these that share vertices, and `first`, `second` (q,) positions in `clouds`.
+        axis: (3,) of the bone.
+        ids: (c,) activations that see either joint; `by_own`, `by_end` (c, S) how; `gram` (c, c) of their shapes.
+    """
+
+    own: int
+    end: int
+    channels: tuple[int, int]
+    helpers: Tensor
+    clouds: Tensor
+    pairs: Tensor
+    first: Tensor
+    second: Tensor
+    axis: Tensor
+    ids: Tensor
+    by_own: Tensor
+    by_end: Tensor
+    gram: Tensor
+
+
+class TwistShare:
+    """Searches how the twist of a limb is shared between the bone that helpers undo and the next one.
+
+    Args:
+        rig: the public joints, with `procedural`.
+        driven: its helpers.
+        offsets: what tells the share.
+        joints: (T,) weighted joints, helpers among them.
+        pairs: (p, 2) of them that share vertices.
+        fitted: (v,) vertices that count.
+    """
+
+    def __init__(
+        self,
+        rig: Rig,
+        driven: DrivenJoints,
+        offsets: PoseOffsets,
+        joints: np.ndarray,
+        pairs: np.ndarray,
+        fitted: np.ndarray,
+    ) -> None:
+        assert rig.procedural is not None
+        self.driven, self.offsets = driven, offsets
+        names = (*rig.joint_names, *rig.procedural.joint_names)
+        channel, row = driven.joint.tolist(), {int(joint): index for index, joint in enumerate(joints)}
+        device = driven.mix.device
+        self.limbs = []
+        for segment in rig.procedural.definition.segments:
+            own, end = names.index(segment.start), names.index(segment.end)
+            helpers = np.array([names.index(name) for name in segment.helpers])
+            known = own in channel and end in channel and all(int(helper) in row for helper in helpers)
+            if not (segment.reverse and known and rig.parents[end] == own and driven.turning):
+                continue
+            clouds = np.array([row[int(helper)] for helper in helpers])
+            both = np.flatnonzero(np.isin(pairs, clouds).all(1))
+            first, second = (np.searchsorted(clouds, pairs[both, side]) for side in (0, 1))
+            index = {"helpers": helpers - rig.joint_count, "clouds": clouds, "pairs": both, "first": first,
+                     "second": second}  # fmt: skip
+            self.limbs.append(
+                _Limb(
+                    own=own, end=end, channels=(channel.index(own), channel.index(end)),
+                    axis=driven.spin_axis[int(helpers[0]) - rig.joint_count],
+                    **{name: torch.as_tensor(array, device=device) for name, array in index.items()},
+                    **offsets.seen_by(own, end, fitted),
+                )
+            )  # fmt: skip
+
+    def __call__(self, pose: Pose, view: View, rest: RestMoments, scale: Tensor) -> Pose:
+        """The pose with the best share of every limb, as far as moments tell.
+
+        Args:
+            pose, view: where to look from.
+            rest: of the identities.
+            scale: (F,) size of the bodies.
+        """
+        relative = pose.relative.clone()
+        for limb in self.limbs:
+            angle = torch.linspace(-math.pi, math.pi, _SHARES).to(relative)
+            energy = self._skin(limb, angle, view, rest) + self._moves(limb, angle, pose.relative, view, scale)
+            turn = axis_angle_to_matrix(angle[energy.argmin(1)][:, None] * limb.axis)
+            relative[:, limb.own] = relative[:, limb.own] @ turn
+            relative[:, limb.end] = turn.mT @ relative[:, limb.end]
+        return replace(pose, relative=relative)
+
+    def _skin(self, limb: _Limb, angle: Tensor, view: View, rest: RestMoments) -> Tensor:
+        """Change (F, a) of the error by what the helpers do when the bone turns by each `angle` (a,)."""
+        driven = self.driven
+        assert rest.driven is not None
+        own, end = limb.channels
+        turned = view.turns[:, None, limb.own] @ axis_angle_to_matrix(angle[:, None] * limb.axis)  # (F, a, 3, 3)
+        above = view.turns[:, driven.reference[own], None].squeeze(1)[:, None]
+        given = rest.driven
+        before = given.left[:, None, own].mT @ above.mT @ turned @ given.right[:, None, own]
+        after = given.left[:, None, end].mT @ turned.mT @ view.turns[:, None, limb.end] @ given.right[:, None, end]
+        twists = [
+            half_angle(seen, given.axis[:, None, which])[0] for seen, which in ((before, own), (after, end))
+        ]
+        mix = driven.mix[limb.helpers]
+        spin = twists[0][..., None] * mix[:, own] + twists[1][..., None] * mix[:, end]
+        spun = turned[:, :, None] @ axis_angle_to_matrix(spin[..., None] * driven.spin_axis[limb.helpers])
+        helpers = driven.public_count + limb.helpers
+        step = (turned[:, :, None] @ rest.offsets[:, None, helpers, :, None]).squeeze(-1)
+        placed = view.places[:, None, limb.own, None] + step
+        change = torch.cat(
+            (spun - view.turns[:, None, helpers], (placed - view.places[:, None, helpers])[..., None]), -1
+        )
+        energy = 2 * (change * view.residual[:, None, limb.clouds]).sum((-3, -2, -1))
+        first, second = change[:, :, limb.first], change[:, :, limb.second]
+        both = ((first @ rest.second[:, None, limb.pairs]) * second).sum((-2, -1))
+        return energy + (both * torch.where(limb.first == limb.second, 1.0, 2.0).to(both)).sum(-1)
+
+    def _moves(self, limb: _Limb, angle: Tensor, relative: Tensor, view: View, scale: Tensor) -> Tensor:
+        """Change (F, a) of the error by what the offsets do."""
+        assert view.activity is not None and view.activity.before is not None and view.pull is not None
+        turn = axis_angle_to_matrix(angle[:, None] * limb.axis)
+        own = self.offsets.features(relative[:, limb.own, None] @ turn, limb.own)
+        end = self.offsets.features(turn.mT @ relative[:, limb.end, None], limb.end)
+        still = [self.offsets.features(relative[:, joint, None], joint) for joint in (limb.own, limb.end)]
+        seen = (own - still[0]) @ limb.by_own.T + (end - still[1]) @ limb.by_end.T
+        before = view.activity.before[:, None, limb.ids]
+        moved = self.offsets.squashed(before + seen) - self.offsets.squashed(before)
+        square = ((moved @ limb.gram) * moved).sum(-1)
+        return 2 * (moved * view.pull[:, None, limb.ids]).sum(-1) + scale[:, None].square() * square

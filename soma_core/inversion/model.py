@@ -1,0 +1,229 @@
+"""The forward model as a fit sees it: what it moves, how far that is from a target, and how that changes."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from soma_core.inversion.driven import DrivenJoints, rig_with_helpers
+from soma_core.inversion.gauss_newton import HINGE_STIFFNESS, GaussNewton, damped_inverse
+from soma_core.inversion.limbs import LimbStart, TwistShare
+from soma_core.inversion.moments import RestMoments, SkinMoments
+from soma_core.inversion.offsets import PoseOffsets
+from soma_core.inversion.problem import Activity, Pose, Problem, View
+from soma_core.inversion.start import ProcrustesStart
+from soma_core.inversion.structure import skin_structure
+from soma_core.inversion.tables import solver_tables
+from soma_core.kernels.model_residual import ModelResidual
+from soma_core.layer import SomaLayer
+from soma_core.skeleton.identity import Identity
+
+if TYPE_CHECKING:
+    from soma_core.kernels.pose_solver_wp import PoseSolver
+
+__all__ = ["PoseModel"]
+
+
+class PoseModel(torch.nn.Module):
+    """Skinning of one layer, with or without twist joints and correctives, and the solver of its poses.
+
+    Args:
+        layer: the forward model.
+        plain: skinning by the public joints alone, whatever the layer adds.
+        warp: run the Warp twins.
+
+    Attributes:
+        structure, moments, solver, start: of the rig; twist joints are joints of it.
+        driven: the twist joints; None without.
+        offsets: what a pose adds to the rest shape; None without.
+    """
+
+    def __init__(self, layer: SomaLayer, *, plain: bool, warp: bool) -> None:
+        super().__init__()
+        kind = {"dtype": layer.dtype, "device": layer.device}
+        fitted = np.ones(layer.mesh.vertex_count, bool)
+        fitted[layer.mesh.face_interior] = False
+        twisting = layer.procedural and not plain
+        rig = rig_with_helpers(layer.rig) if twisting else layer.rig
+        self.rig, self.fitted = rig, fitted
+        self.animation = layer.posing if twisting else layer.animation
+        self.correctives = None if plain else layer.correctives
+        self.structure = structure = skin_structure(rig, fitted)
+        self.driven = DrivenJoints(layer.rig, **kind) if twisting else None
+        self.moments = SkinMoments(structure, rig, warp=warp, **kind)
+        self.solver = GaussNewton(structure, warp=warp, driven=self.driven, **kind)
+        limbs = None if self.driven is None else LimbStart(layer.rig, self.driven, structure.joints)
+        self.start = ProcrustesStart(structure, public_count=layer.rig.joint_count, limbs=limbs, **kind)
+        self.offsets = None
+        if self.correctives is not None:
+            self.offsets = PoseOffsets.of_correctives(self.correctives, rig, structure.joints, fitted, **kind)
+        self.share = None
+        if self.driven is not None and self.offsets is not None:
+            self.share = TwistShare(
+                layer.rig, self.driven, self.offsets, structure.joints, structure.pairs, fitted
+            )
+        self._steps = self._step_kernels() if self.solver.kernels is not None else None
+        self._warp, self._kind = warp, kind
+        orient = rig.t_pose_world[:, :3, :3].copy()
+        orient[0] = np.eye(3)
+        self.register_buffer("orient", torch.as_tensor(orient).to(**kind), persistent=False)
+
+    @functools.cached_property
+    def residual(self) -> ModelResidual:
+        """Compares poses with targets; made when first asked for."""
+        shapes = None if self.offsets is None else self.offsets.shapes
+        return ModelResidual(self.animation.posed_skinning.weights.csr, shapes, warp=self._warp, **self._kind)
+
+    def _step_kernels(self) -> PoseSolver:
+        from soma_core.kernels.pose_solver_wp import PoseSolver
+
+        if self.offsets is None:
+            assert self.solver.kernels is not None
+            return self.solver.kernels
+        tables = solver_tables(self.structure, self.driven, self.offsets)
+        where = self.solver.variables.device
+        return PoseSolver(
+            tables.counts, tables.lists, tables.numbers, dtype=self.offsets.gram.dtype, device=where
+        )
+
+    def bone_offsets(self, identity: Identity, bone_scale: Tensor | None) -> Tensor:
+        """Bone vectors in T-pose world axes, of twist joints too, (i, J, 3) [m]."""
+        offsets = self.animation.bone_vectors(identity, bone_scale)
+        if self.driven is None:
+            return offsets
+        own = self.driven.offsets(identity.bind_world, bone_scale)
+        batch = max(len(offsets), len(own))
+        return torch.cat((offsets.expand(batch, -1, 3), own.expand(batch, -1, 3)), 1)
+
+    def rest(self, identity: Identity, weights: Tensor, bone_scale: Tensor | None = None) -> RestMoments:
+        """Moments of identities under vertex weights (1 or i, v)."""
+        rest = self.moments.rest(self._whole(identity), weights, self.bone_offsets(identity, bone_scale))
+        return self._with_driven(rest, identity)
+
+    def each(
+        self, vertices: Tensor, identity: Identity, weights: Tensor, bone_scale: Tensor | None
+    ) -> tuple[RestMoments, Tensor, Tensor]:
+        """Moments, ``R`` and origin of frames that each have an identity or vertex weights of their own."""
+        offsets = self.bone_offsets(identity, bone_scale)
+        rest, target, origin = self.moments.each(vertices, self._whole(identity), weights, offsets)
+        return self._with_driven(rest, identity), target, origin
+
+    def _whole(self, identity: Identity) -> Identity:
+        return identity if self.driven is None else self.driven.extended(identity)
+
+    def _with_driven(self, rest: RestMoments, identity: Identity) -> RestMoments:
+        if self.driven is None:
+            return rest
+        return replace(rest, driven=self.driven.rest(identity.bind_world))
+
+    def view(self, problem: Problem, pose: Pose, bound: Tensor | None = None) -> View:
+        """Error of poses, and its exact derivative.
+
+        Args:
+            problem: targets, weights and identity.
+            pose: about the problem's origin.
+            bound: residuals beyond it count linearly, (F,) [m]; None counts all squared.
+        """
+        turns, places = self.walk(pose, problem.rest)
+        activity = None if self.offsets is None else self.offsets.activity(pose.relative)
+        found = self.residual(*self._posed(problem, turns, places, activity), bound)
+        assert found.forces is not None
+        bind = self._whole(problem.identity).bind_world[:, self.moments.joints]
+        turn = self.orient[self.moments.joints] @ bind[..., :3, :3].mT
+        forces = found.forces[:, self.moments.joints]
+        about = forces[..., :3] - forces[..., 3:] * bind[..., None, :3, 3]
+        residual = torch.cat((about @ turn.mT, forces[..., 3:]), -1)
+        if self._steps is None:
+            slope = self.solver.slopes(turns, places, problem.rest, residual)
+        else:
+            constants = self.solver.constants(problem.rest)
+            slope = self._steps.slopes(constants, pose.relative, pose.translation, residual)
+        if self.offsets is not None and activity is not None and found.pull is not None:
+            above = turns[:, self.solver.parents[: self.solver.public_count]]
+            more = self.offsets.slopes(found.pull, activity, pose.relative, above)[:, self.solver.variables]
+            slope = slope + torch.nn.functional.pad(more, (0, 0, 0, 1))
+        return View(
+            energy=found.energy, slope=slope, residual=residual, pull=found.pull, turns=turns, places=places,
+            activity=activity,
+        )  # fmt: skip
+
+    def walk(self, pose: Pose, rest: RestMoments) -> tuple[Tensor, Tensor]:
+        """World turns (F, J', 3, 3) and places (F, J', 3) of all joints, twist joints too."""
+        if self._steps is None:
+            return self.solver.walk(pose, rest)
+        return self._steps.walked(self.solver.constants(rest), pose.relative, pose.translation)
+
+    def distances(
+        self, problem: Problem, pose: Pose, *, energy_only: bool = False
+    ) -> tuple[Tensor | None, Tensor]:
+        """Vertex errors (F, v) [m] of poses, and the weighted sum of their squares (F,) [m^2]."""
+        turns, places = self.walk(pose, problem.rest)
+        activity = None if self.offsets is None else self.offsets.activity(pose.relative)
+        given = self._posed(problem, turns, places, activity)
+        found = self.residual(*given, gradient=False, distances=not energy_only)
+        return found.distances, found.energy
+
+    def _posed(self, problem: Problem, turns: Tensor, places: Tensor, activity: Activity | None):
+        """What :class:`ModelResidual` takes."""
+        identity = problem.identity
+        bind = self._whole(identity).bind_world
+        turn = turns @ (self.orient @ bind[..., :3, :3].mT)
+        shift = places - (turn @ bind[..., :3, 3:]).squeeze(-1)
+        transforms = torch.cat((turn, shift[..., None]), -1)
+        value = scale = None
+        if activity is not None:
+            value, scale = activity.value, self.scale(problem).expand(len(turns))
+        return (
+            identity.rest, problem.weights, transforms, value, scale, problem.vertices, problem.origin,
+        )  # fmt: skip
+
+    def scale(self, problem: Problem) -> Tensor:
+        """Size of the bodies beside the canonical one, (1 or F,)."""
+        if self.correctives is None:
+            return problem.origin.new_ones(1)
+        return self.correctives.scale(problem.identity.bind_world)
+
+    def inverse(
+        self, problem: Problem, pose: Pose, view: View, damping: Tensor, mass: Tensor
+    ) -> Callable[[Tensor], Tensor]:
+        """Maps slopes (F, n + 1, 3) to steps: the inverse of the damped matrix, terms included.
+
+        Args:
+            problem, pose, view: where.
+            damping: (F,) relative to the diagonal.
+            mass: (F,) sums of the vertex weights.
+        """
+        terms = problem.terms
+        if self._steps is None:
+            matrix = self.matrix(problem, pose, view)
+            if terms is not None:
+                self.solver.add_terms(matrix, torch.zeros_like(view.slope), pose.relative, view.turns, terms, mass)
+            return damped_inverse(matrix, damping)
+        activity = scale = None
+        if view.activity is not None:
+            slope = view.activity.slope
+            activity = torch.ones_like(view.activity.value) if slope is None else slope
+            scale = self.scale(problem).expand(len(mass))
+        factor = self._steps.factorise(
+            self.solver.constants(problem.rest), pose.relative, pose.translation, damping, mass, activity, scale,
+            stiffness=HINGE_STIFFNESS, soft=self.solver.soft(terms, pose.translation),
+        )  # fmt: skip
+        steps = self._steps
+        return lambda slope: steps.solve(factor, slope)
+
+    def matrix(self, problem: Problem, pose: Pose, view: View) -> Tensor:
+        """Gauss-Newton matrix (F, n + 1, 3, n + 1, 3) of the whole model at a pose."""
+        matrix, _ = self.solver.normal_equations(view.turns, view.places, problem.rest)
+        if self.offsets is None or view.activity is None:
+            return matrix
+        fold = None if self.driven is None else self.solver.fold(view.turns, problem.rest)
+        scale = self.scale(problem).expand(len(view.turns))
+        return matrix + self.offsets.matrix(
+            view.activity, pose.relative, view.turns, view.places, self.solver, fold, scale
+        )

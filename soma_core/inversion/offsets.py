@@ -1,0 +1,302 @@
+"""What a pose adds to the rest shape, as the fit sees it: activations, their slopes, and a few modes.
+
+Offsets are ``sum_c a_c(pose) V_c`` with constant shapes V. Pose correctives and pose blend shapes are of this
+form; they differ in how activations follow from the rotations: ``a = tanh(relu(W f))`` or ``a = f`` with f a
+linear function of every joint's local rotation.
+
+The derivative of the error is exact. Its Gauss-Newton matrix needs ``J_b^T J_b`` and ``J_s^T J_b``, where J_b is
+the motion by offsets and J_s that by skinning. Both are read from moments that are made once: shapes of one
+joint's activations are replaced by their largest modes, and vertices move as if each influence were rigid. What
+that leaves out only changes the path to the minimum.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import scipy.sparse
+import torch
+from torch import Tensor
+
+from soma_core.correctives.model import Correctives
+from soma_core.geometry.rotations import skew
+from soma_core.geometry.sparse import SparseRows
+from soma_core.inversion.gauss_newton import GaussNewton
+from soma_core.inversion.problem import Activity
+from soma_core.rig.skeleton import Rig
+
+__all__ = ["PoseOffsets"]
+
+_LEAST_MODE = 3e-5
+"""Root mean square motion of all vertices [m] below which a mode of one joint's shapes is left out."""
+
+
+class PoseOffsets(torch.nn.Module):
+    """Offsets of one rig and mesh.
+
+    Args:
+        left, right: (J, 3, 3); the features of joint j are the first columns of ``left_j R_j right_j``, less
+            their value at the pose without offsets.
+        still: (J, 3, columns) that value.
+        first: W (C, 3 columns J); None where activations are the features.
+        squash: apply tanh after relu; without `first` neither is applied.
+        shapes: V (3 v, C), the three rows of a vertex together [m].
+        owner: (C,) joint that each activation belongs to: activations of a joint share modes.
+        rig: joints and weights that carry the skin, driven ones included.
+        fitted: (v,) vertices that count.
+
+    Attributes:
+        owners, reads, taken, gate, modes: blocks of the activations of one joint: their joint (P,), the joints
+            that they read (P, R), their ids (P, C'), their part of W (P, C', R, S), and their modes (P, K, C').
+        gram: (P K, P K) products of modes.
+        torque, force: (T, 3, P K) of modes on the weighted joints' clouds, in the joints' own axes.
+    """
+
+    def __init__(
+        self,
+        *,
+        left: np.ndarray,
+        right: np.ndarray,
+        still: np.ndarray,
+        first: scipy.sparse.csr_array | None,
+        squash: bool,
+        shapes: scipy.sparse.csr_array,
+        owner: np.ndarray,
+        rig: Rig,
+        joints: np.ndarray,
+        fitted: np.ndarray,
+        dtype: torch.dtype,
+        device: torch.device | str,
+    ) -> None:
+        super().__init__()
+        self.squash, self.columns = squash, still.shape[-1]
+        kind = {"dtype": dtype, "device": device}
+        self.first = None if first is None else SparseRows(first, **kind)
+        self.shapes = SparseRows(shapes, **kind)
+
+        def keep(name: str, array: np.ndarray) -> None:
+            tensor = torch.as_tensor(np.ascontiguousarray(array), device=device)
+            tensor = tensor.to(dtype) if tensor.is_floating_point() else tensor
+            self.register_buffer(name, tensor, persistent=False)
+
+        keep("left", left)
+        keep("right", right)
+        keep("still", still)
+        blocks = _blocks(first, owner, len(left), 3 * self.columns)
+        for name, array in blocks.items():
+            keep(name, array)
+        modes, moved = _modes(shapes, blocks["taken"], fitted)
+        keep("modes", modes)
+        for name, array in _moments(moved, rig, joints, fitted).items():
+            keep(name, array)
+
+    @classmethod
+    def of_correctives(
+        cls, correctives: Correctives, rig: Rig, joints: np.ndarray, fitted: np.ndarray, *, dtype, device
+    ) -> PoseOffsets:
+        """Those of a layer's correctives; `rig` and `joints` as of the class, with the twist joints."""
+        features = correctives.features
+        left, right = (
+            np.concatenate([np.zeros((1, 3, 3)), part.double().cpu().numpy()])
+            for part in (features.left, features.right)
+        )
+        still = np.broadcast_to(np.eye(3)[:, :2], (len(left), 3, 2)).copy()
+        still[0] = 0
+        first, second = (_matrix(rows) for rows in (correctives.first, correctives.second))
+        return cls(
+            left=left, right=right, still=still, first=first, squash=correctives.use_tanh, shapes=second,
+            owner=correctives.owner, rig=rig, joints=joints, fitted=fitted, dtype=dtype, device=device,
+        )  # fmt: skip
+
+    def activity(self, relative: Tensor) -> Activity:
+        """Activations of local rotations (F, J, 3, 3), the virtual root's included."""
+        turned = (self.left @ relative @ self.right)[..., : self.columns] - self.still
+        features = turned.flatten(1)
+        if self.first is None:
+            return Activity(value=features)
+        before = self.first(features.T.contiguous()).T
+        value = self.squashed(before)
+        rising = (before > 0).to(before)
+        slope = rising * (1 - value * value) if self.squash else rising
+        return Activity(value=value, before=before, slope=slope)
+
+    def squashed(self, before: Tensor) -> Tensor:
+        """Activations from what goes into them."""
+        value = torch.relu(before)
+        return torch.tanh(value) if self.squash else value
+
+    def features(self, relative: Tensor, joint: int) -> Tensor:
+        """Features (..., S) of local rotations (..., 3, 3) of one joint."""
+        turned = (self.left[joint] @ relative @ self.right[joint])[..., : self.columns] - self.still[joint]
+        return turned.flatten(-2)
+
+    def seen_by(self, own: int, end: int, fitted: np.ndarray) -> dict[str, Tensor]:
+        """Activations that read either of two joints: their ids, how they read them, and products of shapes."""
+        width = 3 * self.columns
+        reads = self.gate.new_zeros(self.shapes.shape[1] + 1, 2, width)
+        for which, joint in enumerate((own, end)):
+            block, place = torch.nonzero(self.reads == joint, as_tuple=True)
+            reads[self.taken[block].flatten(), which] = self.gate[block, :, place].flatten(0, 1)
+        ids = torch.nonzero((reads[:-1] != 0).any(-1).any(-1)).flatten()
+        shapes = _matrix(self.shapes)[:, ids.cpu().numpy()]
+        counted = scipy.sparse.diags_array(np.repeat(fitted.astype(np.float64), 3)) @ shapes
+        gram = torch.as_tensor((shapes.T @ counted).toarray()).to(reads)
+        return {"ids": ids, "by_own": reads[ids, 0], "by_end": reads[ids, 1], "gram": gram}
+
+    def slopes(self, pull: Tensor, activity: Activity, relative: Tensor, above: Tensor) -> Tensor:
+        """Derivative (F, J, 3) by world turns of each joint, from that by activations (F, C).
+
+        Args:
+            pull: derivative of an energy by the activations.
+            activity: of the pose.
+            relative: (F, J, 3, 3) local rotations.
+            above: (F, J, 3, 3) world turns of the parents.
+        """
+        if self.first is not None:
+            pull = self.first.pull_back(pull * activity.slope)
+        by_feature = pull.unflatten(1, (-1, 3, self.columns))
+        by_rotation = self.left.mT @ by_feature @ self.right[..., : self.columns].mT
+        product = relative @ by_rotation.mT
+        spin = torch.stack(
+            (
+                product[..., 1, 2] - product[..., 2, 1],
+                product[..., 2, 0] - product[..., 0, 2],
+                product[..., 0, 1] - product[..., 1, 0],
+            ),
+            -1,
+        )
+        return (above @ spin[..., None]).squeeze(-1)
+
+    def responses(self, activity: Activity, relative: Tensor, above: Tensor) -> Tensor:
+        """How world turns of the joints that it reads move every mode, (F, P, K, R, 3)."""
+        axes = skew(above)  # row a of `above`: the world's axis a in the axes of the parent
+        turned = self.left[:, None] @ (axes @ relative[:, :, None]) @ self.right[:, None]
+        change = turned[..., : self.columns].flatten(-2)  # (F, J, 3, S)
+        change = torch.nn.functional.pad(change, (0, 0, 0, 0, 0, 1))[:, self.reads]  # (F, P, R, 3, S)
+        gate = self.gate
+        if activity.slope is None:
+            seen = torch.einsum("pkc,pcrs->pkrs", self.modes, gate)
+            return torch.einsum("pkrs,fpras->fpkra", seen, change)
+        slope = torch.nn.functional.pad(activity.slope, (0, 1))[:, self.taken]  # (F, P, C')
+        seen = torch.einsum("fpkc,pcrs->fpkrs", self.modes * slope[:, :, None], gate)
+        return torch.einsum("fpkrs,fpras->fpkra", seen, change)
+
+    def matrix(
+        self,
+        activity: Activity,
+        relative: Tensor,
+        turns: Tensor,
+        places: Tensor,
+        solver: GaussNewton,
+        fold: Tensor | None,
+        scale: Tensor,
+    ) -> Tensor:
+        """What to add to the matrix (F, n + 1, 3, n + 1, 3) of :meth:`GaussNewton.normal_equations`.
+
+        Args:
+            activity, relative: of the pose.
+            turns, places: of all joints.
+            solver: whose variables the matrix has.
+            fold: of :meth:`GaussNewton.fold`; None without driven joints.
+            scale: (F,) size of the bodies; moments are those of the canonical one.
+        """
+        n, frames = len(solver.variables), len(turns)
+        public = solver.public_count
+        above = turns[:, solver.parents[:public]]
+        response = self.responses(activity, relative, above)  # (F, P, K, R, 3)
+        modes = response.shape[1] * response.shape[2]
+        spread = turns.new_zeros(frames, modes, len(self.left) + 1, 3)
+        index = self.reads.repeat_interleave(response.shape[2], 0)[None, :, :, None]
+        spread.scatter_add_(2, index.expand(frames, -1, -1, 3), response.flatten(1, 2))
+        spread = spread[:, :, solver.variables].flatten(2)  # (F, M, 3 n)
+        size = scale[:, None, None]
+        left = self._pulled(turns, places, solver, fold, scale).flatten(1, 2)  # (F, 3 n + 3, M)
+        left[:, : 3 * n] += 0.5 * size * (self.gram @ spread).mT
+        half = torch.nn.functional.pad(left @ spread, (0, 3))
+        return ((half + half.mT) * size).unflatten(1, (n + 1, 3)).unflatten(3, (n + 1, 3))
+
+    def _pulled(
+        self, turns: Tensor, places: Tensor, solver: GaussNewton, fold: Tensor | None, scale: Tensor
+    ) -> Tensor:
+        """Torque of every mode's motion about each variable, and its force, (F, n + 1, 3, M)."""
+        joints, all_variables = solver.joints, solver.movable
+        own = turns[:, joints]
+        torque, force = scale[:, None, None, None] * (own @ self.torque), own @ self.force
+        torque = torque + skew(places[:, joints]) @ force
+        subtree = solver.above.to(torque)
+        torque, force_below = (torch.einsum("nt,ftam->fnam", subtree, one) for one in (torque, force))
+        torque = torque - skew(places[:, all_variables]) @ force_below
+        rows = torch.cat((torque, force.sum(1, keepdim=True)), 1)
+        return rows if fold is None else solver.folded(rows, fold)
+
+
+def _matrix(rows: SparseRows) -> scipy.sparse.csr_array:
+    start, column, value = (part.cpu().numpy() for part in rows.csr)
+    return scipy.sparse.csr_array((value.astype(np.float64), column, start), shape=rows.shape)
+
+
+def _blocks(
+    first: scipy.sparse.csr_array | None, owner: np.ndarray, joint_count: int, width: int
+) -> dict[str, np.ndarray]:
+    """Activations of each owner, the joints that they read, and their weights; padded."""
+    count = len(owner)
+    if first is None:
+        first = scipy.sparse.csr_array(scipy.sparse.eye_array(count))
+    owners = np.unique(owner)
+    ids = [np.flatnonzero(owner == one) for one in owners]
+    reads = [np.unique(first[part].tocoo().col // width) for part in ids]
+    taken = np.full((len(owners), max(map(len, ids))), count)
+    read = np.full((len(owners), max(map(len, reads))), joint_count)
+    gate = np.zeros((len(owners), taken.shape[1], read.shape[1], width))
+    for row, (part, found) in enumerate(zip(ids, reads, strict=True)):
+        taken[row, : len(part)], read[row, : len(found)] = part, found
+        columns = (width * found[:, None] + np.arange(width)).ravel()
+        gate[row, : len(part), : len(found)] = first[part][:, columns].toarray().reshape(len(part), -1, width)
+    return {"owners": owners, "taken": taken, "reads": read, "gate": gate}
+
+
+def _modes(
+    shapes: scipy.sparse.csr_array, taken: np.ndarray, fitted: np.ndarray
+) -> tuple[np.ndarray, scipy.sparse.csr_array]:
+    """Modes (P, K, C') of each block, orthonormal, and what one unit of each moves, (3 v, P K)."""
+    counted = scipy.sparse.diags_array(np.repeat(fitted.astype(np.float64), 3)) @ shapes
+    least = _LEAST_MODE * np.sqrt(fitted.sum())
+    found = []
+    for row in taken:
+        part = counted[:, row[row < shapes.shape[1]]]
+        square = (part.T @ part).toarray()
+        values, vectors = np.linalg.eigh(square)
+        kept = np.flatnonzero(values > least**2)[::-1]
+        found.append(vectors[:, kept].T)
+    width = max(map(len, found))
+    modes = np.zeros((len(taken), width, taken.shape[1]))
+    columns, rows, values = [], [], []
+    for p, (row, part) in enumerate(zip(taken, found, strict=True)):
+        ids = row[row < shapes.shape[1]]
+        modes[p, : len(part), : len(ids)] = part
+        k, c = np.meshgrid(p * width + np.arange(len(part)), ids, indexing="ij")
+        columns.append(k.ravel()), rows.append(c.ravel()), values.append(part.ravel())
+    mixing = scipy.sparse.csr_array(
+        (np.concatenate(values), (np.concatenate(rows), np.concatenate(columns))),
+        shape=(shapes.shape[1], len(taken) * width),
+    )
+    return modes, scipy.sparse.csr_array(counted @ mixing)
+
+
+def _moments(
+    moved: scipy.sparse.csr_array, rig: Rig, joints: np.ndarray, fitted: np.ndarray
+) -> dict[str, np.ndarray]:
+    """Products of modes, and their torque about and force on each weighted joint, in the joint's own axes."""
+    planes = [scipy.sparse.csr_array(moved[axis::3]) for axis in range(3)]
+    weights = scipy.sparse.csr_array(rig.weights.tocsc()[:, joints].T @ scipy.sparse.diags_array(fitted * 1.0))
+    force = np.stack([(weights @ plane).toarray() for plane in planes], 1)  # (T, 3, M)
+    arms = [scipy.sparse.csr_array(weights @ scipy.sparse.diags_array(rig.bind_shape[:, a])) for a in range(3)]
+
+    def moment(arm: int, plane: int) -> np.ndarray:
+        return (arms[arm] @ planes[plane]).toarray()
+
+    torque = np.stack([moment(b, c) - moment(c, b) for b, c in ((1, 2), (2, 0), (0, 1))], 1)
+    centre = rig.bind_world[joints, :3, 3]
+    torque -= np.cross(centre[:, :, None], force, axis=1)
+    orient = rig.t_pose_world[joints, :3, :3].copy()
+    turn = orient @ rig.bind_world[joints, :3, :3].transpose(0, 2, 1)
+    return {"gram": (moved.T @ moved).toarray(), "torque": turn @ torque, "force": turn @ force}

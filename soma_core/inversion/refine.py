@@ -1,0 +1,156 @@
+"""Descent on the error of the whole model: exact energy and slope, a matrix from moments (paper, section 3.6).
+
+Each step evaluates the model once. The Gauss-Newton matrix of :meth:`PoseModel.matrix` is close to the true one;
+pairs of earlier steps and changes of the slope make up for the rest (limited-memory BFGS, Nocedal and Wright,
+chapter 7, with that matrix in place of a multiple of the identity).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from soma_core.inversion.model import PoseModel
+from soma_core.inversion.problem import Pose, Problem, View
+
+__all__ = ["Refinement"]
+
+_MEMORY = 5
+"""Earlier steps that a new one is made from."""
+
+_START_DAMPING = 1e-6
+_LOWER, _RAISE, _LEAST_RAISED, _MOST_DAMPING = 0.1, 10.0, 1e-4, 1e4
+"""Levenberg damping relative to the diagonal: start, factors after a good and a bad step, least value after a
+bad one, largest."""
+
+_NOISE = {torch.float32: 1e-6, torch.float64: 1e-14}
+"""Relative rounding of an energy."""
+
+_FLOOR = {torch.float32: 1e-7, torch.float64: 0.0}
+"""Root mean square error [m] that is rounding."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Memory:
+    """Steps (F, m, d) and changes of the slope (F, m, d); zero where a step was refused."""
+
+    steps: Tensor
+    changes: Tensor
+
+    def after(self, step: Tensor, change: Tensor, better: Tensor) -> _Memory:
+        keep = better[:, None]
+        steps = torch.cat((self.steps, torch.where(keep, step, 0.0)[:, None]), 1)[:, -_MEMORY:]
+        changes = torch.cat((self.changes, torch.where(keep, change, 0.0)[:, None]), 1)[:, -_MEMORY:]
+        kept = better[:, None, None]  # what led to a refused step is not asked again
+        return _Memory(steps=torch.where(kept, steps, 0.0), changes=torch.where(kept, changes, 0.0))
+
+    def direction(self, slope: Tensor, solve: Callable[[Tensor], Tensor]) -> Tensor:
+        """Approximate inverse of the matrix times `slope` (F, d)."""
+        product = (self.steps * self.changes).sum(-1)
+        length = self.steps.norm(dim=-1) * self.changes.norm(dim=-1)
+        known = product > 1e-6 * length
+        inverse = torch.where(known, 1 / product.where(known, torch.ones_like(product)), 0.0)
+        used, left = [], slope
+        for i in reversed(range(self.steps.shape[1])):
+            share = inverse[:, i] * (self.steps[:, i] * left).sum(-1)
+            used.append(share)
+            left = left - share[:, None] * self.changes[:, i]
+        found = solve(left)
+        for i, share in enumerate(reversed(used)):
+            back = inverse[:, i] * (self.changes[:, i] * found).sum(-1)
+            found = found + (share - back)[:, None] * self.steps[:, i]
+        return found
+
+
+class Refinement:
+    """Lowers the error of a model from a pose; never raises it.
+
+    Args:
+        model: the forward model.
+        problem: targets, identity and terms.
+        bound: residuals beyond it count linearly, (F,) [m]; None is least squares.
+    """
+
+    def __init__(self, model: PoseModel, problem: Problem, bound: Tensor | None = None) -> None:
+        self.model, self.problem, self.bound = model, problem, bound
+        self.mass = problem.weights.sum(1).expand(len(problem.vertices))
+
+    def __call__(self, start: Pose, *, iterations: int, tolerance: float) -> Pose:
+        """Refine poses.
+
+        Args:
+            start: where to begin, about the problem's origin.
+            iterations: largest number of evaluations of the model after the first.
+            tolerance: a frame rests once its Newton decrement, as a root mean square change of the vertices,
+                is below this [m].
+        """
+        solver = self.model.solver
+        pose, view = start, self._view(start)
+        damping = torch.full_like(self.mass, _START_DAMPING)
+        moving = torch.ones_like(start.accepted, dtype=torch.bool)
+        none = view.slope.new_zeros(len(moving), 0, view.slope[0].numel())
+        memory = _Memory(steps=none, changes=none)
+        solve = self.model.inverse(self.problem, pose, view, damping, self.mass)
+        floor = _FLOOR[self.mass.dtype] ** 2 * self.mass
+        for count in range(iterations):
+            if count:
+                solve = self.model.inverse(self.problem, pose, view, damping, self.mass)
+            shape = view.slope.shape
+            step = -memory.direction(view.slope.flatten(1), lambda one, to=solve: to(one.view(shape)).flatten(1))
+            step = solver.shortened(step.view(shape), view.turns, self.problem.terms)
+            decrement = (-(step * view.slope).sum((1, 2)).clamp_max(0) / self.mass).sqrt()
+            pose = replace(pose, last_change=torch.where(moving, decrement, pose.last_change))
+            moving = moving & ~(decrement < tolerance)
+            if not bool(moving.any()):
+                break
+            trial = solver.retract(pose, view.turns, step)
+            seen = self._view(trial)
+            better = moving & (seen.energy < view.energy * (1 + _NOISE[self.mass.dtype]) + floor)
+            memory = memory.after(step.flatten(1), (seen.slope - view.slope).flatten(1), better)
+            pose = Pose(
+                relative=_chosen(better, trial.relative, pose.relative),
+                translation=_chosen(better, trial.translation, pose.translation),
+                accepted=pose.accepted + better,
+                last_change=pose.last_change,
+            )
+            view = _chosen_view(better, seen, view)
+            lower, higher = damping * _LOWER, (damping * _RAISE).clamp(_LEAST_RAISED, _MOST_DAMPING)
+            damping = torch.where(better, lower, higher)
+        return pose
+
+    def _view(self, pose: Pose) -> View:
+        view = self.model.view(self.problem, pose, self.bound)
+        terms = self.problem.terms
+        if terms is None:
+            return view
+        slope = view.slope.clone()
+        n = self.model.solver.variables
+        above = view.turns[:, self.model.solver.parents[n]]
+        _, more = terms.normal_equations(pose.relative[:, n], above)
+        slope[:, : len(n)] += self.mass[:, None, None] * more
+        energy = view.energy + self.mass * terms.energy(pose.relative[:, n])
+        return replace(view, slope=slope, energy=energy)
+
+
+def _chosen(better: Tensor, new: Tensor, old: Tensor) -> Tensor:
+    return torch.where(better.view(-1, *[1] * (new.ndim - 1)), new, old)
+
+
+def _chosen_view(better: Tensor, new: View, old: View) -> View:
+    parts = {}
+    for name, value in vars(new).items():
+        before = getattr(old, name)
+        if isinstance(value, Tensor):
+            parts[name] = _chosen(better, value, before)
+        elif value is not None:
+            kept = {
+                key: None if one is None else _chosen(better, one, getattr(before, key))
+                for key, one in vars(value).items()
+            }
+            parts[name] = type(value)(**kept)
+        else:
+            parts[name] = None
+    return View(**parts)
