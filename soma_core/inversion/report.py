@@ -21,6 +21,9 @@ __all__ = ["InversionReport"]
 _LISTED = 100
 """Frames that could not be used are listed by number up to this many."""
 
+_ANGLE_EDGES = np.geomspace(1e-4, 360.0, 1513)
+"""Bins of the standard deviations of joint angles [degrees], 1 % wide."""
+
 _MM = 1e3
 _SUMMED = ("frames", "valid", "converged", "iterations", "counts", "sums", "histogram", "changes")
 _LARGEST = ("most_iterations", "orthonormality", "maxima", "peaks")
@@ -42,6 +45,7 @@ class InversionReport:
         self._order = np.concatenate(list(regions.values()))
         self._ends = np.cumsum([len(ids) for ids in regions.values()])
         self._shoulders = shoulder_region(rig)
+        self._joints = rig.user_joint_names
         count = len(regions)
         self._state: dict[str, np.ndarray] = {
             "frames": np.zeros((), np.int64),
@@ -56,6 +60,7 @@ class InversionReport:
             "histogram": np.zeros((count, BIN_COUNT), np.int64),
             "changes": np.zeros(2),  # how many pairs of frames, sum of the mean change [m]
             "peaks": np.zeros(2),  # largest change of the region's mean and of one vertex [m]
+            "angles": np.zeros((0, len(_ANGLE_EDGES) - 1), np.int64),  # joints, once there are any
             "unusable": np.zeros(0, np.int64),
             "first_shoulders": np.zeros((0, len(self._shoulders)), np.float32),
             "last_shoulders": np.zeros((0, len(self._shoulders)), np.float32),
@@ -71,7 +76,7 @@ class InversionReport:
                 expected=f"{len(self._order)}, as in the mesh of the report",
                 fix="Make the report with the mesh and rig of the layer.",
             )
-        self.merge(self._errors(error) | _counted(result))
+        self.merge(self._errors(error) | _counted(result) | {"angles": _angle_counts(result)})
 
     def _errors(self, error: np.ndarray) -> dict[str, np.ndarray]:
         """Statistics of the vertex errors (frames, v) [m]."""
@@ -102,6 +107,8 @@ class InversionReport:
         seam = _changes(np.concatenate(pair) if consecutive else later["first_shoulders"][:0])
         merged["changes"] = merged["changes"] + seam["changes"]
         merged["peaks"] = np.maximum(merged["peaks"], seam["peaks"])
+        counts = [part["angles"] for part in (mine, later) if len(part["angles"])]
+        merged["angles"] = sum(counts[1:], counts[0]) if counts else mine["angles"]
         merged["unusable"] = np.concatenate([mine["unusable"], mine["frames"] + later["unusable"]])
         for name, first, second in (("first_shoulders", mine, later), ("last_shoulders", later, mine)):
             merged[name] = np.array(first[name] if len(first[name]) else second[name])
@@ -130,7 +137,16 @@ class InversionReport:
                 "peak": _MM * float(state["peaks"][0]) if pairs else None,
                 "peak_of_a_vertex": _MM * float(state["peaks"][1]) if pairs else None,
             },
+            **self._angles(),
         }
+
+    def _angles(self) -> dict[str, dict[str, float | None]]:
+        """Median standard deviation of each joint's angle [degrees] by name, where the fit tells any."""
+        counts = self._state["angles"]
+        if not len(counts):
+            return {}
+        medians = [_angle_median(row) for row in counts]
+        return {"angle_std_degrees": dict(zip(self._joints, medians, strict=True))}
 
     def _figures(self, regions: list[int]) -> dict[str, float | None]:
         """Mean, median, P95 and maximum over some regions together [mm]."""
@@ -196,6 +212,28 @@ def _counted(result: InversionResult) -> dict[str, np.ndarray]:
         "orthonormality": np.array(float(skew.max()) if skew.numel() else 0.0),
         "unusable": np.flatnonzero(~valid),
     }
+
+
+def _angle_counts(result: InversionResult) -> np.ndarray:
+    """Histogram (J - 1, bins) of the standard deviations of joint angles; none where the fit tells none."""
+    found = getattr(result, "angle_std", None)
+    bins = len(_ANGLE_EDGES) - 1
+    if found is None:
+        return np.zeros((0, bins), np.int64)
+    angles = found.detach()[result.valid].cpu().double().numpy()
+    counts = np.zeros((found.shape[1], bins), np.int64)
+    frame, joint = np.nonzero(np.isfinite(angles))
+    places = np.searchsorted(_ANGLE_EDGES, angles[frame, joint], side="right") - 1
+    np.add.at(counts, (joint, np.clip(places, 0, bins - 1)), 1)
+    return counts
+
+
+def _angle_median(counts: np.ndarray) -> float | None:
+    """Median of a histogram of angles [degrees], to 1 %; None where nothing was counted."""
+    if not counts.any():
+        return None
+    place = int(np.searchsorted(np.cumsum(counts), counts.sum() / 2))
+    return float(np.sqrt(_ANGLE_EDGES[place] * _ANGLE_EDGES[place + 1]))
 
 
 def _cell(value: float | None) -> str:

@@ -23,7 +23,14 @@ from soma_core.io.sam3d import SAM3D_SUFFIXES
 from soma_core.io.soma_npz import METRES_PER_UNIT
 from soma_core.rig import load_canonical
 from soma_core.tasks.convert_bodies import ShownBody, sam3d_body, smpl_body
-from soma_core.tasks.fit_job import FitJob, ResultFiles, fingerprint, fit_settings
+from soma_core.tasks.fit_job import (
+    FitJob,
+    ResultFiles,
+    fingerprint,
+    fit_settings,
+    refuse_no_fit,
+    refuse_unfit,
+)
 from soma_core.tasks.fitted_chunks import FittedChunks, refuse_other_settings
 from soma_core.tasks.found_identity import found_identity
 from soma_core.tasks.posed_model import FitBackends
@@ -171,7 +178,10 @@ class Converter:
         }  # fmt: skip
         earlier = earlier_report(files.report, files.motion, settings)
         if earlier is not None:
+            _refuse_failed(path, earlier, files.report)
             return Converted(report=earlier, earlier=True)
+        with torch.no_grad():
+            refuse_unfit(body.backend.inversion, posed, layer.identity(body.params))
         plan = {**settings, "shown": config.picture.frames}
         kept = FittedChunks(chunks, plan, frame_count=posed.sequence.frame_count, size=config.chunk)
         stored = {"backend": layer.backend, "params": body.params}
@@ -189,7 +199,9 @@ class Converter:
         )  # fmt: skip
         job.fit_missing()
         job.write_results()
-        return Converted(report=_read_report(files.report))
+        report = _read_report(files.report)
+        _refuse_failed(path, report, files.report)
+        return Converted(report=report)
 
 
 def earlier_report(file: Path, result: Path, settings: Mapping[str, Any]) -> dict[str, Any] | None:
@@ -211,6 +223,17 @@ def earlier_report(file: Path, result: Path, settings: Mapping[str, Any]) -> dic
         return None  # the file was written anew
     refuse_other_settings(file, before, now)
     return report
+
+
+def _refuse_failed(path: Path, report: Mapping[str, Any], file: Path) -> None:
+    """Refuse a fit that is none; where the body lies is the readers' to say, who know the file's axes.
+
+    Raises:
+        SomaError: what is wrong with it.
+    """
+    found = report.get("diagnosis")
+    if found and found["cause"] != "axis":
+        refuse_no_fit(path, found, file)
 
 
 def _read_report(path: Path) -> dict[str, Any]:

@@ -6,7 +6,7 @@ import hashlib
 import json
 import logging
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -15,6 +15,9 @@ import torch
 from omegaconf import OmegaConf
 
 from soma_core.cache import atomic_write
+from soma_core.config.choices import Upward
+from soma_core.errors import SomaError
+from soma_core.inversion.diagnosis import Diagnosis, diagnose_fit
 from soma_core.io.motion_files import write_motion_parts
 from soma_core.progress import progress
 from soma_core.tasks.fit_results import chunk_arrays, draw_worst, fitted_motions, joined_report, per_frame
@@ -28,9 +31,12 @@ if TYPE_CHECKING:
     from soma_core.tasks.fitted_chunks import FittedChunks
     from soma_core.tasks.posed_input import PosedInput
 
-__all__ = ["FitJob", "ResultFiles", "fingerprint", "fit_settings"]
+__all__ = ["FitJob", "ResultFiles", "fingerprint", "fit_settings", "refuse_no_fit", "refuse_unfit"]
 
 _log = logging.getLogger(__name__)
+
+_FIRST_LOOK, _LAST_LOOK = 8, 64
+"""Frames, spread over the sequence, that tell before the fit and after it whether it is one."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -102,8 +108,8 @@ class FitJob:
             result = result.part(slice(start - begin, stop - begin))
             self.chunks.save(number, chunk_arrays(result, layer, start=start, kept=kept, apart=self._apart))
 
-    def write_results(self) -> InversionReport:
-        """Join the chunks into the files of the result, and delete them."""
+    def write_results(self) -> tuple[InversionReport, Diagnosis | None]:
+        """Join the chunks into the files of the result, and delete them; say what is wrong with the fit."""
         layer, chunks = self.inversion.layer, self.chunks
         source = f"fitted to {self.posed.sequence.path.name}"
         identity = {**self.stored, **({"options": layer.options} if layer.options else {})}
@@ -129,11 +135,57 @@ class FitJob:
             count=self.picture.frames, apart=self._apart, width=self.picture.width,
         )  # fmt: skip
         report = joined_report(chunks, layer)
-        document = {"settings": dict(self.settings), **report.as_dict()}
+        found = self._diagnosis(frames["mean_error"])
+        told = None if found is None else asdict(found)
+        document = {"settings": dict(self.settings), **report.as_dict(), "diagnosis": told}
         text = json.dumps(document, indent=2, default=float) + "\n"
         atomic_write(self.files.report, lambda path: path.write_text(text, encoding="utf-8") and None)
         chunks.remove()
-        return report
+        return report, found
+
+    def _diagnosis(self, errors: np.ndarray) -> Diagnosis | None:
+        """What is wrong with the fit, by some of its frames and their mean errors [m], NaN where unusable."""
+        usable = np.flatnonzero(np.isfinite(errors))
+        numbers, vertices = self.posed.spread(_LAST_LOOK, usable if len(usable) else None)
+        return _diagnosed(
+            self.inversion, self.posed, self.identity, vertices, errors=errors[numbers], frames=numbers,
+            searched=self.settings["identity"]["method"] != "known",
+        )  # fmt: skip
+
+
+def _diagnosed(
+    inversion: PoseInversion, posed: PosedInput, identity: Identity, vertices: np.ndarray, **known: Any
+) -> Diagnosis | None:
+    layer = inversion.layer
+    given = torch.as_tensor(vertices).to(layer.device, layer.dtype)
+    with torch.no_grad():
+        canonical = inversion.canonical(given, posed.topology)
+    return diagnose_fit(layer, identity, canonical, axes=posed.axes, ups=[*Upward], **known)
+
+
+def refuse_unfit(inversion: PoseInversion, posed: PosedInput, identity: Identity) -> None:
+    """Look at some frames before a fit, and refuse vertices that no pose of any body explains.
+
+    Raises:
+        SomaError: they are mirrored, or in another order.
+    """
+    _, vertices = posed.spread(_FIRST_LOOK)
+    found = _diagnosed(inversion, posed, identity, vertices)
+    if found is not None and found.failed and found.cause in ("order", "mirrored"):
+        raise SomaError(f"{posed.sequence.path}: {found.sentence}.")
+
+
+def refuse_no_fit(path: Path, found: Mapping[str, Any] | None, report: Path) -> None:
+    """Say what is wrong with a fit that was written, as its report has it.
+
+    Raises:
+        SomaError: it is no fit.
+    """
+    if found is None:
+        return
+    if found["failed"]:
+        raise SomaError(f"{path}: {found['sentence']}; {report} has the figures.")
+    _log.warning("%s: %s", path.name, found["sentence"])
 
 
 def _margin(inversion: PoseInversion) -> int:

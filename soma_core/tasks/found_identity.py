@@ -55,11 +55,9 @@ def found_identity(
 def _search(
     layer: SomaLayer, posed: PosedInput, params: Mapping[str, Any], choice: Mapping[str, Any]
 ) -> IdentityFit:
-    """Fit to frames spread over the sequence, read one by one."""
-    total = posed.sequence.frame_count
-    spread = np.unique(np.linspace(0, total - 1, min(max(choice["frames"], 1), total)).round().astype(int))
-    _log.info("finding the identity from %d frames", len(spread))
-    vertices = np.concatenate([posed.read(frame, frame + 1) for frame in spread.tolist()])
+    """Fit to frames spread over the sequence, read one by one; gaps are avoided where there is a choice."""
+    numbers, vertices = posed.spread(max(choice["frames"], 1))
+    _log.info("finding the identity from %d frames", len(numbers))
     found = fit_identity(
         layer,
         torch.as_tensor(vertices).to(layer.device, layer.dtype),

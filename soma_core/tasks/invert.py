@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,7 +17,14 @@ from soma_core.io.vertex_files import open_vertex_sequence
 from soma_core.io.vertex_sequence import VertexSequence
 from soma_core.layer import SomaLayer
 from soma_core.tasks.animate import given_params
-from soma_core.tasks.fit_job import FitJob, ResultFiles, fingerprint, fit_settings
+from soma_core.tasks.fit_job import (
+    FitJob,
+    ResultFiles,
+    fingerprint,
+    fit_settings,
+    refuse_no_fit,
+    refuse_unfit,
+)
 from soma_core.tasks.fitted_chunks import FittedChunks
 from soma_core.tasks.found_identity import found_identity
 from soma_core.tasks.posed_input import PosedInput
@@ -37,7 +45,8 @@ def run(config: DictConfig, output: Path) -> None:
     chunks stay in ``output/chunks`` until the end: the same run in the same folder goes on after them.
 
     Raises:
-        SomaError: the backend or the input cannot be used.
+        SomaError: the backend or the input cannot be used, or the fit is none; what there is of it is
+            written all the same.
     """
     if config.chunk < 1:
         raise InputError("chunk", got=config.chunk, expected="at least 1", fix="Try chunk=256.")
@@ -48,8 +57,10 @@ def run(config: DictConfig, output: Path) -> None:
         except KeyboardInterrupt:
             _log.warning("stopped; the same command with hydra.run.dir=%s goes on from here", output)
             raise
-    for line in job.write_results().as_text().splitlines():
+        report, found = job.write_results()
+    for line in report.as_text().splitlines():
         _log.info("%s", line)
+    refuse_no_fit(job.posed.sequence.path, asdict(found) if found else None, job.files.report)
 
 
 def _open_input(config: DictConfig) -> VertexSequence:
@@ -64,8 +75,13 @@ def _open_input(config: DictConfig) -> VertexSequence:
         config.input,
         fps=config.fps,
         unit=str(config.unit) if config.unit else None,
-        up=f"+{config.up}" if config.up else None,
+        up=_direction(str(config.up)) if config.up else None,
     )
+
+
+def _direction(up: str) -> Any:
+    """The upward axis with its sign."""
+    return up if up.startswith("-") else f"+{up}"
 
 
 def _prepare(config: DictConfig, sequence: VertexSequence, output: Path) -> FitJob:
@@ -99,8 +115,6 @@ def _prepare(config: DictConfig, sequence: VertexSequence, output: Path) -> FitJ
         "inversion": fit_settings(config.inversion),
         "rig": layer.rig.revision,
     }
-    made_from = {**settings, "content": fingerprint(sequence.path), "shown": config.picture.frames}
-    chunks = FittedChunks(output / "chunks", made_from, frame_count=sequence.frame_count, size=config.chunk)
     _log.info(
         "%s: %d frames of %d vertices (%s) at %g fps",
         sequence.path.name, sequence.frame_count, sequence.vertex_count, posed.topology, sequence.fps,
@@ -108,6 +122,9 @@ def _prepare(config: DictConfig, sequence: VertexSequence, output: Path) -> FitJ
     fit = PoseInversion(
         layer, **inversion_options(settings["inversion"]), kernels=str(config.inversion.kernels)
     )
+    refuse_unfit(fit, posed, identity)
+    made_from = {**settings, "content": fingerprint(sequence.path), "shown": config.picture.frames}
+    chunks = FittedChunks(output / "chunks", made_from, frame_count=sequence.frame_count, size=config.chunk)
     stored = {"backend": layer.backend, "params": params}
     if settings["identity"]["method"] != "known":
         file = chunks.folder / "identity.npz"

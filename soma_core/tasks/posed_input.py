@@ -21,8 +21,13 @@ __all__ = ["PosedInput"]
 
 Topology = Literal["canonical", "native"]
 
-_FORWARD: dict[str, Axis] = {"+y": "+z", "+z": "-y"}
-"""Where a body looks whose file says only which way is up."""
+_FORWARD: dict[str, Axis] = {
+    "+y": "+z", "+z": "-y", "-y": "-z", "-z": "+y", "+x": "+z", "-x": "+z",
+}  # fmt: skip
+"""Where a body looks whose file says only which way is up: -Y up is a camera's view of one who faces it."""
+
+_NEARBY = 4
+"""How many frames are looked at for one without gaps."""
 
 _SAME_SIZE = 3.0
 """A body curls up to half its extent; three times more or less is another unit."""
@@ -43,7 +48,7 @@ class PosedInput:
     def __init__(
         self, sequence: VertexSequence, layer: SomaLayer, *, topology: Literal["auto", "canonical", "native"]
     ) -> None:
-        self.sequence = sequence
+        self.sequence, self._spec = sequence, layer.spec
         counts = _vertex_counts(layer)
         found = _told_apart(sequence, layer, counts) if topology == "auto" else topology
         _check_count(sequence, layer, counts, found)
@@ -63,8 +68,48 @@ class PosedInput:
             return vertices
         return vertices @ self._frame.T.astype(vertices.dtype)
 
+    @property
+    def axes(self) -> np.ndarray:
+        """Rotation (3, 3) from the axes of the file to +Y up, +Z forward."""
+        spec = self._spec
+        native = native_to_canonical(spec.up, spec.forward) if self.topology == "native" else np.eye(3)
+        turn: np.ndarray = native @ self._frame
+        return turn / np.cbrt(np.linalg.det(turn))
+
+    def spread(self, count: int, among: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
+        """Up to `count` frames, evenly spread; one with gaps gives way to a neighbour without.
+
+        Args:
+            count: how many.
+            among: numbers of the frames to choose from, ascending; None for all.
+
+        Returns:
+            Numbers (n,) of the frames, and their vertices (n, v, 3).
+        """
+        frames = np.arange(self.sequence.frame_count) if among is None else among
+        places = np.unique(np.linspace(0, len(frames) - 1, min(count, len(frames))).round().astype(int))
+        numbers, kept = [], []
+        for place, end in zip(places, [*places[1:], len(frames)], strict=True):
+            number, vertices = self._whole(frames[place : min(end, place + _NEARBY)])
+            numbers.append(number)
+            kept.append(vertices)
+        return np.array(numbers), np.concatenate(kept)
+
+    def _whole(self, frames: np.ndarray) -> tuple[int, np.ndarray]:
+        """The first of some frames without gaps, or the first of them."""
+        first = self.read(int(frames[0]), int(frames[0]) + 1)
+        found = int(frames[0]), first
+        for frame in frames[1:].tolist():
+            if np.isfinite(found[1]).all():
+                return found
+            found = frame, self.read(frame, frame + 1)
+        return found if np.isfinite(found[1]).all() else (int(frames[0]), first)
+
     def check_size(self, layer: SomaLayer, identity: Identity) -> None:
-        """Refuse a body of another size than its identity: the usual mistake is a unit wrong by 100.
+        """Refuse a body of another size than its identity, if another unit would do better.
+
+        The usual mistake is a unit wrong by 100. An adult is three to four times as large as a newborn,
+        and a fit says so.
 
         Raises:
             InputError: no frame among the first ones is usable, or the size is off by more than threefold.
@@ -78,6 +123,8 @@ class PosedInput:
         told = _metres(self.sequence, layer, self.topology)
         name = next((unit for unit, metres in METRES.items() if metres == told), f"units of {told:g} m")
         fitting = min(METRES, key=lambda name: abs(np.log(sizes[0] / told * METRES[name] / expected)))
+        if fitting == name:
+            return
         raise InputError(
             str(self.sequence.path),
             got=f"a body {sizes[0] / expected:.3g} times as large as its identity, for lengths in {name}",

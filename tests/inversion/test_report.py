@@ -1,6 +1,8 @@
 """The report: exact means and maxima, regions that add up, and the same whatever the chunks."""
 
 import json
+from itertools import pairwise
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -169,3 +171,32 @@ def test_the_table_names_every_region(canonical, result):
 def test_a_result_of_another_mesh_is_refused(result):
     with pytest.raises(InputError, match=r"result\.vertex_error: got 4505 vertices, expected 18056"):
         InversionReport(*load_canonical("mid")).add(result)
+
+
+def test_angle_deviations_are_medians_of_usable_frames_whatever_the_chunks(canonical, result):
+    """By joint name; a joint that no frame determines has none, and a fit that tells none adds no key."""
+    assert "angle_std_degrees" not in reported(canonical, result, [FRAMES])
+    angles = 0.5 * torch.arange(1, FRAMES + 1)[:, None].expand(-1, 77).clone()
+    angles[4] = 100  # not usable
+    angles[:, 3] = torch.inf
+    values = {name: getattr(result, name) for name in result.__dataclass_fields__} | {"angle_std": angles}
+    found = []
+    for cuts in ([0, FRAMES], [0, 5, 6, FRAMES]):
+        report = InversionReport(*canonical)
+        for start, stop in pairwise(cuts):
+            report.add(SimpleNamespace(**{name: array[start:stop] for name, array in values.items()}))
+        found.append(report.as_dict()["angle_std_degrees"])
+    assert found[0] == found[1]
+    names = canonical[1].user_joint_names
+    assert list(found[0]) == list(names)
+    assert found[0][names[3]] is None
+    assert found[0][names[0]] == pytest.approx(3.5, rel=0.01)
+
+
+def test_angle_deviations_survive_a_chunk_without_any(canonical, result):
+    report = InversionReport(*canonical)
+    values = {name: getattr(result, name) for name in result.__dataclass_fields__}
+    report.add(result)
+    report.add(SimpleNamespace(**values | {"angle_std": torch.full((FRAMES, 77), 2.0)}))
+    report.add(result)
+    assert report.as_dict()["angle_std_degrees"]["Hips"] == pytest.approx(2.0, rel=0.01)

@@ -1,18 +1,20 @@
 """From a mesh sequence to a motion: the round trip, chunks, interruptions, and what is refused."""
 
 import json
+import os
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 from omegaconf import OmegaConf
 
-from soma_core.cli import EXIT_OK, main
+from soma_core.cli import EXIT_FAILED, EXIT_OK, main
 from soma_core.config.schema import InvertConfig
-from soma_core.errors import InputError
+from soma_core.errors import InputError, SomaError
 from soma_core.io import open_vertex_sequence, read_motion
 from soma_core.layer import SomaLayer
-from soma_core.tasks import animate, invert
+from soma_core.tasks import animate, convert_file, invert
 from soma_core.tasks.fit_results import worst_frames
 from soma_core.tasks.fitted_chunks import FittedChunks
 
@@ -23,6 +25,9 @@ CHUNK_TOLERANCE = 1e-5
 """Metres: frames are fitted in groups, and a group decides together when it is done."""
 
 FRAMES = 8
+
+CASES = Path(os.environ.get("SOMA_TEST_DATA", "")) / "cases"
+"""SOMA_TEST_DATA names the folder that holds cases/, of files that are not part of the project."""
 
 
 def configured(**changes):
@@ -303,3 +308,142 @@ def test_the_papers_methods_run_from_the_command_line(source, tmp_path, monkeypa
     report = json.loads((tmp_path / "out/report.json").read_text(encoding="utf-8"))
     assert report["settings"]["inversion"]["stages"][0] == "transfer"
     assert ROUND_TRIP_MM < report["error_mm"]["all"]["mean"] < 15
+
+
+def other_body(layer):
+    """The same poses on somebody else."""
+    clip = {"motion": None, "motion_fps": None, "frames": {"start": 0, "stop": 440, "step": 55}}
+    motion = animate.load_motion(OmegaConf.create(clip))
+    turns, hips = torch.as_tensor(motion.rotations), torch.as_tensor(motion.translation)
+    with torch.no_grad():
+        return layer.pose(layer.identity({"shape": [-2.0, 1.0]}), turns, hips).vertices.numpy()
+
+
+def spoil(layer, vertices, kind):
+    """Vertices of which no fit, or a fit of another body, can be made."""
+    random = np.random.default_rng(0)
+    if kind == "mirrored":
+        return vertices * np.array([-1, 1, 1], np.float32)
+    if kind == "order":
+        return vertices[:, random.permutation(vertices.shape[1])]
+    if kind == "person":
+        return other_body(layer)
+    if kind == "change":
+        return np.concatenate([vertices[:4], other_body(layer)[4:]])
+    return vertices * np.nan
+
+
+def command_of(file, **changes):
+    settings = {
+        "input": file, "fps": 24, "unit": "m", "topology": "canonical", "lod": "low", "picture.frames": 0,
+        "hydra.run.dir": "out", "procedural": "false", "backend.params.shape": "[1.0,-0.5]",
+    }  # fmt: skip
+    return ["invert", *(f"{key}={value}" for key, value in (settings | changes).items())]
+
+
+@pytest.mark.parametrize(
+    ("kind", "said"),
+    [
+        ("mirrored", "left-handed axes: negate x of the vertices"),
+        ("order", "in another order than that of 'soma'"),
+        ("person", "another person than the identity: pass identity=unknown"),
+        ("change", "another person's from frame 4 on"),
+        ("missing", "each of the 8 looked at has missing vertices"),
+    ],
+)
+def test_a_fit_that_is_none_ends_with_one_sentence(
+    layer, vertices, tmp_path, monkeypatch, capsys, kind, said
+):
+    monkeypatch.chdir(tmp_path)
+    np.save("body.npy", spoil(layer, vertices, kind))
+    assert main(command_of("body.npy")) == EXIT_FAILED
+    streams = capsys.readouterr()
+    (sentence,) = [line for line in streams.err.splitlines() if line.startswith("soma:")]
+    assert said in sentence
+    assert not streams.out
+    if kind in ("mirrored", "order"):
+        assert not {"motion.npz", "chunks"} & {path.name for path in (tmp_path / "out").iterdir()}
+        return
+    report = json.loads((tmp_path / "out/report.json").read_text(encoding="utf-8"))
+    assert (report["diagnosis"]["cause"], report["diagnosis"]["failed"]) == (kind, True)
+    assert report["diagnosis"]["sentence"] in sentence
+
+
+def test_an_unknown_body_is_not_sought_in_mirrored_vertices(layer, vertices, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    np.save("body.npy", spoil(layer, vertices, "mirrored"))
+    assert main(command_of("body.npy", identity="unknown")) == EXIT_FAILED
+    streams = capsys.readouterr()
+    assert "the body is mirrored" in streams.err
+    assert "finding the identity" not in streams.err
+
+
+@pytest.mark.parametrize("kind", ["noise", "gaps", "spoilt frames"])
+def test_a_good_fit_of_bad_data_is_one(vertices, tmp_path, kind):
+    random = np.random.default_rng(0)
+    given = vertices + random.normal(0, 0.02, vertices.shape).astype(np.float32)
+    if kind == "gaps":
+        given[::2] = np.nan
+    if kind == "spoilt frames":
+        given[[1, 6]] = random.normal(0, 0.3, given[0].shape)
+    np.save(tmp_path / "body.npy", given)
+    invert.run(configured(input=str(tmp_path / "body.npy")), tmp_path / "fit")
+    report = json.loads((tmp_path / "fit/report.json").read_text(encoding="utf-8"))
+    assert report["diagnosis"] is None
+
+
+def test_an_upside_down_body_is_a_warning_that_names_the_axis(vertices, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    np.save("body.npy", vertices[..., [0, 2, 1]] * np.array([1, -1, 1], np.float32))
+    assert main(command_of("body.npy")) == EXIT_OK
+    assert "body.npy: the body is lying on the whole, its head along z of the file" in capsys.readouterr().err
+    assert main(command_of("body.npy", up="z", **{"hydra.run.dir": "again"})) == EXIT_OK
+    assert "its head along" not in capsys.readouterr().err
+
+
+def test_a_downward_y_axis_is_turned_as_a_camera_sees(layer, vertices):
+    """-Y up is +Y up, turned by half a turn about x."""
+    from soma_core.io.vertex_sequence import VertexSequence
+    from soma_core.tasks.posed_input import PosedInput
+
+    class Held(VertexSequence):
+        def _read(self, start, stop):
+            return (vertices * np.array([1, -1, -1], np.float32))[start:stop]
+
+    held = Held(Path("body.npy"), *vertices.shape[:2], metres=1.0, up="-y")
+    posed = PosedInput(held, layer, topology="canonical")
+    np.testing.assert_allclose(posed.read(0, FRAMES), vertices, atol=CHUNK_TOLERANCE)
+    np.testing.assert_allclose(posed.axes, np.diag([1.0, -1, -1]), atol=1e-12)
+    numbers, found = posed.spread(3)
+    np.testing.assert_array_equal(numbers, [0, 4, 7])
+    assert found.shape == (3, *vertices.shape[1:])
+
+
+def test_a_conversion_that_is_no_fit_stays_one(tmp_path):
+    """An earlier run's report says so again; where a body lies is told by who reads the file."""
+    told = {"cause": "person", "sentence": "the body is another's", "failed": True, "frame": None}
+    with pytest.raises(SomaError, match=r"clip\.npz: the body is another's; .*report\.json has the figures"):
+        convert_file._refuse_failed(Path("clip.npz"), {"diagnosis": told}, tmp_path / "report.json")
+    for found in (None, told | {"cause": "axis", "failed": False}):
+        convert_file._refuse_failed(Path("clip.npz"), {"diagnosis": found}, tmp_path / "report.json")
+
+
+@pytest.mark.parametrize(
+    ("name", "code", "said"),
+    [
+        ("mirrored", EXIT_FAILED, "the body is mirrored"),
+        ("other_person", EXIT_FAILED, "pass identity=unknown"),
+        ("y_down", EXIT_OK, "upside down on the whole, its head along -y"),
+    ],
+)
+def test_files_of_others(tmp_path, monkeypatch, capsys, name, code, said):
+    file = CASES / f"20_anny_low_{name}.npy"
+    if not file.is_file():
+        pytest.skip(f"needs SOMA_TEST_DATA with {file}")
+    pytest.importorskip("soma_backend_anny")
+    file = file.resolve()
+    monkeypatch.chdir(tmp_path)
+    command = ["invert", f"input={file}", "fps=30", "unit=m", "backend=anny", "lod=low",
+               "topology=canonical", "picture.frames=0", "hydra.run.dir=out"]  # fmt: skip
+    assert main(command) == code
+    assert said in capsys.readouterr().err
