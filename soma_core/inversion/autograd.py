@@ -19,9 +19,8 @@ from torch import Tensor
 
 from soma_core.animation.engine import Animation
 from soma_core.errors import InputError
-from soma_core.inversion.comparison import part_of
 from soma_core.inversion.gauss_newton import GaussNewton
-from soma_core.inversion.problem import Pose, Problem
+from soma_core.inversion.problem import Pose, Problem, part_of
 
 __all__ = ["Autograd", "AutogradOptions", "from_six"]
 
@@ -212,7 +211,7 @@ class Autograd(torch.nn.Module):
     def _descend(self, start: Pose, offsets: Tensor, loss: _Loss) -> Pose:
         """Adam on the first two columns of every variable turn and on the translation."""
         options, n = self.options, self.variables
-        turns, _ = self.solver.walk(start, offsets)
+        turns, _ = self.solver.walk_public(start, offsets)
         six, shift = turns[:, n, :, :2].clone().requires_grad_(), start.translation.clone().requires_grad_()
         groups = [{"params": [six], "lr": options.rate}, {"params": [shift], "lr": options.shift_rate}]
         adam = torch.optim.Adam(groups, betas=_BETAS)

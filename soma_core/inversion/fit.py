@@ -15,15 +15,14 @@ from soma_core.errors import InputError
 from soma_core.inversion._inputs import check_vertices, check_weights, refuse_unit_error
 from soma_core.inversion.analytical import AnalyticalOptions
 from soma_core.inversion.autograd import AutogradOptions
-from soma_core.inversion.comparison import compare, part_of
 from soma_core.inversion.implicit import attach_gradient
-from soma_core.inversion.ladder import Ladder, LadderOptions, Stage
-from soma_core.inversion.moments import RestMoments, SkinMoments
+from soma_core.inversion.ladder import Ladder, LadderOptions, Stage, Targets
+from soma_core.inversion.model import PoseModel
+from soma_core.inversion.moments import RestMoments
 from soma_core.inversion.priors import PosePriors, joint_terms, neighbour_mean, with_references
-from soma_core.inversion.problem import Pose, Problem
+from soma_core.inversion.problem import Pose, part_of
 from soma_core.inversion.result import InversionResult, joined
 from soma_core.inversion.start import cloud_extent
-from soma_core.inversion.structure import moment_structure
 from soma_core.layer import Kernels, SomaLayer
 from soma_core.rig import load_canonical
 from soma_core.skeleton.identity import Identity
@@ -52,7 +51,7 @@ class _Frames:
     identity: Identity
     weights: Tensor
     bone_scale: Tensor | None
-    rest: RestMoments | None
+    rest: dict[PoseModel, RestMoments]
     initial: InversionResult | None = None
     reference: Tensor | None = None
 
@@ -98,7 +97,7 @@ class PoseInversion(torch.nn.Module):
         autograd: AutogradOptions | None = None,
         robust: float | None = None,
         robust_rounds: int = 10,
-        refreshes: int = 6,
+        refreshes: int = 30,
         priors: PosePriors | None = None,
         kernels: Kernels = "auto",
     ) -> None:
@@ -115,19 +114,22 @@ class PoseInversion(torch.nn.Module):
         self.layer, self.priors = layer, priors or PosePriors()
         # Not measured on CUDA, where one thread would hold a whole frame: the dense reference runs there.
         self.warp = warp = kernels == "warp" or (kernels == "auto" and layer.device.type == "cpu")
-        structure = moment_structure(layer.mesh, layer.rig)
+        self.ladder = Ladder(layer, options, warp=warp)
         kind = {"dtype": layer.dtype, "device": layer.device}
-        self.moments = SkinMoments(structure, layer.rig, warp=warp, **kind)
-        self.ladder = Ladder(layer, structure, self.moments, options, warp=warp)
-        self.terms = joint_terms(self.priors, [layer.rig.joint_names[j] for j in structure.variables], **kind)
-        fitted = torch.as_tensor(structure.fitted, device=layer.device)
+        names = layer.rig.joint_names
+        self.terms = joint_terms(self.priors, [names[j] for j in self.model.solver.variables.tolist()], **kind)
+        fitted = torch.as_tensor(self.model.fitted, device=layer.device)
         self.register_buffer("default_weights", fitted.to(layer.dtype), persistent=False)
+
+    @property
+    def model(self) -> PoseModel:
+        """The forward model that is fitted."""
+        return self.ladder.model
 
     def prepare(self, identity: Identity, weights: Tensor | None = None) -> RestMoments:
         """What a fit needs of an identity under vertex weights."""
         weights = check_weights(weights, self.default_weights, identity.batch_size)
-        offsets = self.layer.animation.kinematics.local_offsets(identity.bind_world)
-        return self.moments.rest(identity, weights, offsets)
+        return self.model.rest(identity, weights)
 
     def forward(
         self,
@@ -165,7 +167,7 @@ class PoseInversion(torch.nn.Module):
             result = self._fit_all(frames)
             strength = self.priors.temporal_strength
             for _ in range(self.priors.temporal_rounds if strength else 0):
-                variables = result.rotations[:, self.ladder.solver.variables - 1]
+                variables = result.rotations[:, self.model.solver.variables - 1]
                 reference = neighbour_mean(variables, result.valid)
                 result = self._fit_all(replace(frames, initial=result, reference=reference))
         if not (torch.is_grad_enabled() and canonical.requires_grad):
@@ -181,7 +183,7 @@ class PoseInversion(torch.nn.Module):
                 fix="Pass vertices.detach(), or leave out robust and temporal_strength.",
             )
         rotations, translation = attach_gradient(
-            vertices, result.rotations, result.translation, solver=self.ladder.solver, moments=self.moments,
+            vertices, result.rotations, result.translation, solver=self.model.solver, moments=self.model.moments,
             identity=frames.identity, weights=frames.weights, valid=result.valid, terms=self.terms,
             offsets=self.layer.animation.bone_vectors(frames.identity, frames.bone_scale),
         )  # fmt: skip
@@ -216,7 +218,7 @@ class PoseInversion(torch.nn.Module):
             )  # fmt: skip
         return _Frames(
             vertices=vertices, identity=identity, weights=weights, bone_scale=bone_scale, initial=initial,
-            rest=self.prepare(identity, weights) if shared else None,
+            rest={model: model.prepared(identity, weights) for model in self.ladder.models} if shared else {},
         )  # fmt: skip
 
     def _fit_all(self, frames: _Frames) -> InversionResult:
@@ -254,53 +256,60 @@ class PoseInversion(torch.nn.Module):
     def _fit(self, frames: _Frames) -> tuple[InversionResult, Tensor]:
         """Result and scale of a chunk of frames."""
         vertices, finite = _without_gaps(frames.vertices, frames.weights, self.layer)
-        identity, weights, rest = frames.identity, frames.weights, frames.rest
-        offsets = self.layer.animation.bone_vectors(identity, frames.bone_scale)
-        if rest is None:
-            rest, target, origin = self.moments.each(vertices, identity, weights, offsets)
-        else:
-            rest = replace(rest, offsets=offsets)
-            target, origin = self.moments.target(vertices, rest)
         terms, strength = self.terms, self.priors.temporal_strength
         if frames.reference is not None:
             terms = with_references(terms, frames.reference, strength)
-        problem = Problem(
-            vertices=vertices, weights=weights, identity=identity, rest=rest, target=target, origin=origin,
-            bone_scale=frames.bone_scale, terms=terms,
+        targets = Targets(
+            vertices=vertices, identity=frames.identity, weights=frames.weights, terms=terms,
+            bone_scale=frames.bone_scale, rest=frames.rest,
         )  # fmt: skip
-        extent, side = cloud_extent(target, rest)
+        eye = torch.eye(3, dtype=vertices.dtype, device=vertices.device)
+        start = None
+        if frames.initial is not None:
+            relative = torch.cat((eye.expand(len(vertices), 1, 3, 3), frames.initial.rotations), 1)
+            start = Pose.begin(relative, frames.initial.translation)
+        pose, problem = self.ladder(targets, start)
+        rest = problem.rest
+        extent, side = cloud_extent(problem.target, rest)
         known = torch.where(rest.own[..., 3, 3] > 0, extent, torch.nan)
         scale = known.nanmedian(1).values
         upright = (side * rest.own[..., 3, 3]).sum(1) > 0
         usable = finite & upright & (scale > _SCALES[0]) & (scale < _SCALES[1])
-        eye = torch.eye(3, dtype=vertices.dtype, device=vertices.device)
-        start = None
-        if frames.initial is not None:
-            relative = torch.cat((eye.expand(len(origin), 1, 3, 3), frames.initial.rotations), 1)
-            start = Pose.begin(relative, frames.initial.translation - origin)
-        pose = self.ladder(problem, start)
-        relative = torch.where(usable[:, None, None, None], pose.relative, eye)[:, 1:]
-        translation = torch.where(usable[:, None], pose.translation + origin, torch.zeros_like(origin))
-        error, residual = compare(self.layer, problem, relative, translation, warp=self.warp)
-        error.masked_fill_(~usable[:, None], torch.nan)
+        relative = torch.where(usable[:, None, None, None], pose.relative, eye)
+        translation = torch.where(usable[:, None], pose.translation, torch.zeros_like(pose.translation))
+        near = replace(pose, relative=relative, translation=translation - problem.origin)
+        error, energy = self.model.distances(problem, near)
+        assert error is not None
+        mass = problem.weights.sum(1).clamp_min(torch.finfo(vertices.dtype).tiny)
+        error = error.masked_fill_(~usable[:, None], torch.nan)
         if vertices is not frames.vertices:
             error.masked_fill_(~torch.isfinite(frames.vertices).all(-1), torch.nan)
+        resting = 0.0 if self.ladder.whole is not None else self.ladder.options.tolerance
         return InversionResult(
-            rotations=relative,
+            rotations=relative[:, 1:],
             translation=translation,
             vertex_error=error,
             valid=usable,
             determined=self._determined(extent > _COLLAPSED) & usable[:, None],
-            converged=(pose.last_change < self.ladder.options.tolerance) & usable,
+            converged=((pose.last_change < resting) | (pose.last_change == 0)) & usable,
             iterations=pose.accepted,
-            residual=residual.masked_fill(~usable, torch.nan),
+            residual=(energy / mass).sqrt().masked_fill(~usable, torch.nan),
         ), scale
 
     def _determined(self, kept: Tensor) -> Tensor:
         """(F, J - 1) from the weighted joints (F, T): whether the target determines a user joint."""
-        all_joints = kept.new_zeros(len(kept), self.layer.rig.joint_count)
-        all_joints[:, self.moments.joints] = kept
-        return all_joints[:, 1:]
+        model, count = self.model, self.layer.rig.joint_count
+        known = kept.new_zeros(len(kept), model.solver.joint_count)
+        known[:, model.moments.joints] = kept
+        if model.driven is not None:  # a bone whose skin lies on twist joints is known by theirs
+            known = known[:, :count] | _any_of(known[:, count:], model.driven.start, count)
+        return known[:, 1:]
+
+
+def _any_of(flags: Tensor, owner: Tensor, count: int) -> Tensor:
+    """(F, count) whether any flag (F, H) of each owner is set."""
+    total = flags.new_zeros(len(flags), count, dtype=torch.int64).index_add(1, owner, flags.long())
+    return total > 0
 
 
 def _without_gaps(vertices: Tensor, weights: Tensor, layer: SomaLayer) -> tuple[Tensor, Tensor]:

@@ -251,7 +251,7 @@ class GaussNewton(torch.nn.Module):
 
     def walk(self, pose: Pose, rest: RestMoments) -> tuple[Tensor, Tensor]:
         """Accumulated turns (F, J, 3, 3) and joint positions (F, J, 3) [m], of driven joints too."""
-        turns, places = self._walk_public(pose, rest.offsets)
+        turns, places = self.walk_public(pose, rest.offsets)
         if self.driven is None:
             return turns, places
         assert rest.driven is not None
@@ -265,7 +265,8 @@ class GaussNewton(torch.nn.Module):
         """``[D_t | c_t]`` (F, T, 3, 4) of the weighted joints."""
         return torch.cat((turns, places[..., None]), -1)[:, self.joints]
 
-    def _walk_public(self, pose: Pose, offsets: Tensor) -> tuple[Tensor, Tensor]:
+    def walk_public(self, pose: Pose, offsets: Tensor) -> tuple[Tensor, Tensor]:
+        """The same of the joints that a pose holds; bone vectors `offsets` (1 or F, J, 3) [m]."""
         turns = pose.relative.clone()
         places = torch.zeros_like(pose.relative[..., 0])
         for index in range(self.level_count):

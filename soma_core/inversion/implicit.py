@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from soma_core.geometry.rotations import skew
-from soma_core.inversion.comparison import part_of
+from soma_core.inversion.problem import part_of
 from soma_core.inversion.gauss_newton import GaussNewton
 from soma_core.inversion.moments import RestMoments, SkinMoments
 from soma_core.inversion.priors import JointTerms

@@ -1,4 +1,4 @@
-"""The ladder of stages that takes a chunk of frames from its moments to a pose (paper, section 3.6)."""
+"""The ladder of stages that takes a chunk of frames from its vertices to a pose (paper, section 3.6)."""
 
 from __future__ import annotations
 
@@ -12,16 +12,17 @@ from torch import Tensor
 from soma_core.errors import InputError
 from soma_core.inversion.analytical import Analytical, AnalyticalOptions
 from soma_core.inversion.autograd import Autograd, AutogradOptions
-from soma_core.inversion.gauss_newton import GaussNewton
-from soma_core.inversion.moments import SkinMoments
-from soma_core.inversion.outer import OuterLoop
-from soma_core.inversion.priors import hinge_rotation
+from soma_core.inversion.model import PoseModel
+from soma_core.inversion.moments import RestMoments
+from soma_core.inversion.priors import JointTerms, hinge_rotation
 from soma_core.inversion.problem import Pose, Problem
 from soma_core.inversion.regions import body_regions
-from soma_core.inversion.start import ProcrustesStart, best_translation
-from soma_core.inversion.structure import MomentStructure
+from soma_core.inversion.start import best_translation
 from soma_core.inversion.transfer import SkeletonTransfer
+from soma_core.inversion.whole import WholeFit
 from soma_core.layer import SomaLayer
+from soma_core.rig import load_canonical
+from soma_core.skeleton.identity import Identity
 
 __all__ = ["Ladder", "LadderOptions", "Stage"]
 
@@ -36,7 +37,7 @@ class LadderOptions:
 
     Attributes:
         stages: in order: ``procrustes`` or ``transfer`` starts; ``analytical``, ``gauss_newton`` and
-            ``autograd`` refine.
+            ``autograd`` refine. All but ``procrustes`` and ``gauss_newton`` know plain skinning only.
         iterations: largest number of steps of ``gauss_newton``.
         tolerance: a frame has converged when a step changes its root mean square error, squared, by less
             than this, squared [m].
@@ -44,8 +45,8 @@ class LadderOptions:
         robust: residuals beyond this, and beyond twice the frame's median, count linearly (Huber) [m]; None
             is least squares.
         robust_rounds: how often the residuals are looked at again.
-        refreshes: how often what the full model adds to skinning, twist and correctives, is looked at again;
-            0 ignores it.
+        refreshes: largest number of steps of ``gauss_newton`` under the full model, with twist joints and
+            correctives; 0 fits plain skinning.
 
     Raises:
         InputError: an unknown stage, a negative number of iterations or refreshes, a negative tolerance, a
@@ -59,7 +60,7 @@ class LadderOptions:
     autograd: AutogradOptions = field(default_factory=AutogradOptions)
     robust: float | None = None
     robust_rounds: int = 10
-    refreshes: int = 6
+    refreshes: int = 30
 
     def __post_init__(self) -> None:
         names = get_args(Stage)
@@ -74,7 +75,7 @@ class LadderOptions:
                 "iterations", got=self.iterations, expected="at least 0", fix="Pass iterations=40."
             )
         if self.refreshes < 0:
-            raise InputError("refreshes", got=self.refreshes, expected="at least 0", fix="Pass refreshes=6.")
+            raise InputError("refreshes", got=self.refreshes, expected="at least 0", fix="Pass refreshes=30.")
         if not self.tolerance >= 0:
             raise InputError(
                 "tolerance", got=self.tolerance, expected="a length [m]", fix="Pass tolerance=5e-5."
@@ -83,98 +84,147 @@ class LadderOptions:
             raise InputError("robust", got=self.robust, expected="a length [m]", fix="Pass 0.01, or None.")
 
 
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Targets:
+    """What a chunk of frames is fitted to, whatever the model.
+
+    Attributes:
+        vertices: (F, v, 3) [m], finite.
+        identity: batch of 1, shared by all frames, or of F.
+        weights: (1 or F, v).
+        bone_scale: (1 or F, J - 1); None without.
+        terms: soft terms and hinges; None without.
+        rest: moments of the one identity by model, where there is one.
+    """
+
+    vertices: Tensor
+    identity: Identity
+    weights: Tensor
+    bone_scale: Tensor | None
+    terms: JointTerms | None
+    rest: dict[PoseModel, RestMoments]
+
+    def problem(self, model: PoseModel) -> Problem:
+        """The problem for one model."""
+        return model.problem(
+            self.vertices, self.identity, self.weights, self.bone_scale, self.terms, self.rest.get(model)
+        )
+
+
 class Ladder(torch.nn.Module):
     """Runs the stages in order, each from the result of the one before.
 
     Args:
         layer: the forward model.
-        structure, moments: of its rig.
         options: which stages, and how.
         warp: run the Warp twins.
+
+    Attributes:
+        model: what is fitted in the end.
+        whole: descends on the full model; None where plain skinning is fitted.
     """
 
-    def __init__(
-        self,
-        layer: SomaLayer,
-        structure: MomentStructure,
-        moments: SkinMoments,
-        options: LadderOptions,
-        *,
-        warp: bool,
-    ) -> None:
+    def __init__(self, layer: SomaLayer, options: LadderOptions, *, warp: bool) -> None:
         super().__init__()
-        self.moments, self.options = moments, options
+        self.options = options
         plain = layer.plain or not options.refreshes
-        self.outer = OuterLoop(layer, moments, plain=plain, robust=options.robust)
-        kind = {"dtype": layer.dtype, "device": layer.device}
-        self.solver = GaussNewton(structure, warp=warp, **kind)
-        self.start = ProcrustesStart(structure, **kind)
+        self.model = PoseModel(layer, plain=plain, warp=warp)
+        self.coarse = self.skinned = self.model
+        if not plain and layer.mesh.lod == "mid":
+            self.coarse = PoseModel(layer, plain=False, warp=warp, some=load_canonical("low")[0].mid_ids)
+        paper = set(options.stages) - {"procrustes", "gauss_newton"}
+        if paper and not plain:
+            self.skinned = PoseModel(layer, plain=True, warp=warp)
+        descends = not plain or options.robust is not None
+        self.whole = WholeFit(self.coarse, self.model, options) if descends else None
+        solver, structure = self.skinned.solver, self.skinned.structure
         if "transfer" in options.stages:
+            kind = {"dtype": layer.dtype, "device": layer.device}
             self.skeleton = SkeletonTransfer(structure, layer.mesh, layer.rig, **kind)
         if "analytical" in options.stages:
-            self.analytical = Analytical(structure, layer.rig, self.solver, options=options.analytical)
+            self.analytical = Analytical(structure, layer.rig, solver, options=options.analytical)
         if "autograd" in options.stages:
             regions = body_regions(layer.mesh, layer.rig)
-            self.autograd = Autograd(self.solver, layer.animation, regions=regions, options=options.autograd)
+            self.autograd = Autograd(solver, layer.animation, regions=regions, options=options.autograd)
 
-    def forward(self, problem: Problem, pose: Pose | None = None) -> Pose:
-        """Fit a chunk of frames; `pose` is a warm start in place of the starting stages."""
+    @property
+    def models(self) -> tuple[PoseModel, ...]:
+        """All forward models in use."""
+        return tuple(dict.fromkeys((self.model, self.coarse, self.skinned)))
+
+    def forward(self, targets: Targets, pose: Pose | None = None) -> tuple[Pose, Problem]:
+        """Fit a chunk of frames; a pose's translation is a place in the world.
+
+        Args:
+            targets: what to fit.
+            pose: a warm start in place of the starting stages.
+
+        Returns:
+            The pose, and the problem of the model that was fitted last.
+        """
+        problem = None
         for stage in self.options.stages:
-            if pose is None or stage not in _STARTS:
-                pose = getattr(self, f"_{stage}")(problem, pose)
+            if pose is not None and stage in _STARTS:
+                continue
+            model = self._model_of(stage)
+            problem = targets.problem(model)
+            near = None if pose is None else _moved(pose, -problem.origin)
+            pose = _moved(getattr(self, f"_{stage}")(problem, near, model), problem.origin)
         assert pose is not None
-        rounds = self.options.robust_rounds if self.options.robust is not None else 0
-        if not self.outer.plain:
-            rounds = max(rounds, self.options.refreshes)
-        if rounds:
-            pose = self.outer(problem, pose, self._refined, rounds=rounds)
-        return pose
+        if self.whole is not None and ("gauss_newton" in self.options.stages or self.options.robust is not None):
+            return self.whole(targets, pose)
+        return pose, targets.problem(self.model) if problem is None else problem
 
-    def _procrustes(self, problem: Problem, _pose: Pose | None) -> Pose:
+    def _model_of(self, stage: Stage) -> PoseModel:
+        return self.coarse if stage in ("procrustes", "gauss_newton") else self.skinned
+
+    def _procrustes(self, problem: Problem, _pose: Pose | None, model: PoseModel) -> Pose:
         """Weighted Procrustes of every joint's own points."""
-        return self._placed(problem, self.start(problem.target, problem.rest))
+        return placed(model, problem, model.start(problem.target, problem.rest))
 
-    def _transfer(self, problem: Problem, _pose: Pose | None) -> Pose:
+    def _transfer(self, problem: Problem, _pose: Pose | None, model: PoseModel) -> Pose:
         """The skeleton fit of the posed mesh."""
-        return self._placed(problem, self.skeleton(problem))
+        return placed(model, problem, self.skeleton(problem))
 
-    def _placed(self, problem: Problem, relative: Tensor) -> Pose:
-        """A start: rotations, hinges kept to their axis, and the Hips where the mean residual is zero."""
-        rest, joints, n = problem.rest, self.moments.joints, self.solver.variables
-        if problem.terms is not None:
-            hinged = hinge_rotation(relative[:, n], problem.terms.hinge_axis)
-            relative = relative.index_copy(1, n, hinged)
-        pose = Pose.begin(relative, torch.zeros_like(problem.origin))
-        turns, places = self.solver.walk(pose, rest.offsets)
-        shift = best_translation(problem.target, rest, turns[:, joints], places[:, joints])
-        return replace(pose, translation=shift)
-
-    def _analytical(self, problem: Problem, pose: Pose | None) -> Pose:
+    def _analytical(self, problem: Problem, pose: Pose | None, model: PoseModel) -> Pose:
         """Inverse skinning, level by level."""
-        return self.analytical(problem.target, problem.rest, pose or self._procrustes(problem, None))
+        start = pose or self._procrustes(problem, None, model)
+        return self.analytical(problem.target, problem.rest, start)
 
-    def _gauss_newton(self, problem: Problem, pose: Pose | None) -> Pose:
+    def _gauss_newton(self, problem: Problem, pose: Pose | None, model: PoseModel) -> Pose:
         """Levenberg-Marquardt on the moments."""
-        return self.solver(
+        return model.solver(
             problem.target,
             problem.rest,
-            pose or self._procrustes(problem, None),
+            pose or self._procrustes(problem, None, model),
             iterations=self.options.iterations,
             tolerance=self.options.tolerance,
             terms=problem.terms,
         )
 
-    def _autograd(self, problem: Problem, pose: Pose | None) -> Pose:
+    def _autograd(self, problem: Problem, pose: Pose | None, model: PoseModel) -> Pose:
         """Adam, with the weights of regions."""
-        pose = pose or self._procrustes(problem, None)
+        pose = pose or self._procrustes(problem, None, model)
         if self.autograd.regions:
             weights = self.autograd.weighted(problem.weights)
-            rest = self.moments.rest(problem.identity, weights, problem.rest.offsets)
-            target, _ = self.moments.target(problem.vertices, rest)
-            problem = replace(problem, weights=weights, rest=rest, target=target)
+            rest = model.rest(problem.identity, weights, problem.bone_scale)
+            target, origin = model.moments.target(problem.vertices, rest)
+            pose = _moved(pose, problem.origin - origin)
+            problem = replace(problem, weights=weights, rest=rest, target=target, origin=origin)
         return self.autograd(problem, pose)
 
-    def _refined(self, problem: Problem, pose: Pose) -> Pose:
-        """The last refining stage, from a pose near its solution; Gauss-Newton where there is none."""
-        refining = [stage for stage in self.options.stages if stage not in _STARTS] or ["gauss_newton"]
-        return getattr(self, f"_{refining[-1]}")(problem, pose)
+
+def placed(model: PoseModel, problem: Problem, relative: Tensor) -> Pose:
+    """A start: rotations, hinges kept to their axis, and the Hips where the mean residual is zero."""
+    rest, joints, n = problem.rest, model.moments.joints, model.solver.variables
+    if problem.terms is not None:
+        hinged = hinge_rotation(relative[:, n], problem.terms.hinge_axis)
+        relative = relative.index_copy(1, n, hinged)
+    pose = Pose.begin(relative, torch.zeros_like(problem.origin))
+    turns, places = model.walk(pose, rest)
+    shift = best_translation(problem.target, rest, turns[:, joints], places[:, joints])
+    return replace(pose, translation=shift)
+
+
+def _moved(pose: Pose, shift: Tensor) -> Pose:
+    return replace(pose, translation=pose.translation + shift)

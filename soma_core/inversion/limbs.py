@@ -10,6 +10,7 @@ every share of it.
 from __future__ import annotations
 
 import math
+from collections.abc import Collection
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -17,7 +18,7 @@ import torch
 from torch import Tensor
 
 from soma_core.geometry.kabsch import rotation_from_covariance
-from soma_core.geometry.rotations import axis_angle_to_matrix
+from soma_core.geometry.rotations import axis_angle_to_matrix, matrix_to_quaternion, skew
 from soma_core.inversion.driven import DrivenJoints, half_angle
 from soma_core.inversion.moments import RestMoments
 from soma_core.inversion.offsets import PoseOffsets
@@ -118,7 +119,8 @@ class _Limb:
         clouds: (h,) positions of the helpers among the weighted joints.
         pairs: (q,) pairs of these that share vertices, and `first`, `second` (q,) positions in `clouds`.
         axis: (3,) of the bone.
-        ids: (c,) activations that see either joint; `by_own`, `by_end` (c, S) how; `gram` (c, c) of their shapes.
+        ids: (c,) activations that see either joint; `by_own`, `by_end` (c, S) how; `shapes` (c, r) such that
+            products of their shapes are those of its rows.
     """
 
     own: int
@@ -133,7 +135,7 @@ class _Limb:
     ids: Tensor
     by_own: Tensor
     by_end: Tensor
-    gram: Tensor
+    shapes: Tensor
 
 
 class TwistShare:
@@ -162,7 +164,7 @@ class TwistShare:
         names = (*rig.joint_names, *rig.procedural.joint_names)
         channel, row = driven.joint.tolist(), {int(joint): index for index, joint in enumerate(joints)}
         device = driven.mix.device
-        self.limbs = []
+        self.limbs: list[_Limb] = []
         for segment in rig.procedural.definition.segments:
             own, end = names.index(segment.start), names.index(segment.end)
             helpers = np.array([names.index(name) for name in segment.helpers])
@@ -183,49 +185,78 @@ class TwistShare:
                 )
             )  # fmt: skip
 
-    def __call__(self, pose: Pose, view: View, rest: RestMoments, scale: Tensor) -> Pose:
+    def __call__(
+        self, pose: Pose, view: View, rest: RestMoments, scale: Tensor, held: Collection[int] = ()
+    ) -> Pose:
         """The pose with the best share of every limb, as far as moments tell.
 
         Args:
             pose, view: where to look from.
             rest: of the identities.
             scale: (F,) size of the bodies.
+            held: joints that cannot turn so; limbs with such stay as they are.
         """
         relative = pose.relative.clone()
-        for limb in self.limbs:
-            angle = torch.linspace(-math.pi, math.pi, _SHARES).to(relative)
+        angle = torch.linspace(-math.pi, math.pi, _SHARES).to(relative)
+        for limb in self.free(held):
             energy = self._skin(limb, angle, view, rest) + self._moves(limb, angle, pose.relative, view, scale)
-            turn = axis_angle_to_matrix(angle[energy.argmin(1)][:, None] * limb.axis)
-            relative[:, limb.own] = relative[:, limb.own] @ turn
-            relative[:, limb.end] = turn.mT @ relative[:, limb.end]
+            self.turn(relative, limb, angle[energy.argmin(1)])
         return replace(pose, relative=relative)
 
+    def free(self, held: Collection[int]) -> list[_Limb]:
+        """Limbs neither of whose joints is held."""
+        return [limb for limb in self.limbs if limb.own not in held and limb.end not in held]
+
+    def turn(self, relative: Tensor, limb: _Limb, angle: Tensor) -> None:
+        """Turn a limb's bone about its axis by `angle` (F,), in place; the next joint keeps its world turn."""
+        turn = axis_angle_to_matrix(angle[:, None] * limb.axis)
+        relative[:, limb.own] = relative[:, limb.own] @ turn
+        relative[:, limb.end] = turn.mT @ relative[:, limb.end]
+
     def _skin(self, limb: _Limb, angle: Tensor, view: View, rest: RestMoments) -> Tensor:
-        """Change (F, a) of the error by what the helpers do when the bone turns by each `angle` (a,)."""
-        driven = self.driven
-        assert rest.driven is not None
+        """Change (F, a) of the error by what the helpers do when the bone turns by each `angle` (a,).
+
+        Helpers lie on the bone, so that each turns in place by one angle, and the error is a polynomial in its
+        sine and cosine.
+        """
+        spin = self._spins(limb, angle, view, rest) - self._spins(limb, angle[:1] * 0, view, rest)
+        spin = spin + angle[:, None]  # (F, a, h)
+        across = skew(limb.axis)
+        turns = view.turns[:, self.driven.public_count + limb.helpers]
+        basis = torch.stack((turns @ across, turns @ (across @ across)), 2)  # (F, h, 2, 3, 3)
+        part = torch.stack((torch.sin(spin), 1 - torch.cos(spin)), -1)  # (F, a, h, 2)
+        pulled = (basis * view.residual[:, limb.clouds, None, :, :3]).sum((-2, -1))  # (F, h, 2)
+        energy = 2 * torch.einsum("fahx,fhx->fa", part, pulled)
+        first, second = basis[:, limb.first], basis[:, limb.second]
+        moved = first @ rest.second[:, limb.pairs, None, :3, :3]
+        product = torch.einsum("fqxab,fqyab->fqxy", moved, second)
+        product = product * torch.where(limb.first == limb.second, 1.0, 2.0).to(product)[:, None, None]
+        both = torch.einsum("faqx,fqxy->faqy", part[:, :, limb.first], product)
+        return energy + (both * part[:, :, limb.second]).sum((-2, -1))
+
+    def _spins(self, limb: _Limb, angle: Tensor, view: View, rest: RestMoments) -> Tensor:
+        """Angles (F, a, h) of the helpers when the bone turns by each `angle` (a,)."""
+        driven, given = self.driven, rest.driven
+        assert given is not None
         own, end = limb.channels
-        turned = view.turns[:, None, limb.own] @ axis_angle_to_matrix(angle[:, None] * limb.axis)  # (F, a, 3, 3)
-        above = view.turns[:, driven.reference[own], None].squeeze(1)[:, None]
-        given = rest.driven
-        before = given.left[:, None, own].mT @ above.mT @ turned @ given.right[:, None, own]
-        after = given.left[:, None, end].mT @ turned.mT @ view.turns[:, None, limb.end] @ given.right[:, None, end]
-        twists = [
-            half_angle(seen, given.axis[:, None, which])[0] for seen, which in ((before, own), (after, end))
-        ]
-        mix = driven.mix[limb.helpers]
-        spin = twists[0][..., None] * mix[:, own] + twists[1][..., None] * mix[:, end]
-        spun = turned[:, :, None] @ axis_angle_to_matrix(spin[..., None] * driven.spin_axis[limb.helpers])
-        helpers = driven.public_count + limb.helpers
-        step = (turned[:, :, None] @ rest.offsets[:, None, helpers, :, None]).squeeze(-1)
-        placed = view.places[:, None, limb.own, None] + step
-        change = torch.cat(
-            (spun - view.turns[:, None, helpers], (placed - view.places[:, None, helpers])[..., None]), -1
+        turn = view.turns[:, limb.own]
+        half = 0.5 * angle[:, None]
+        about = torch.cat((torch.cos(half), torch.sin(half) * limb.axis), -1)  # (a, 4)
+        before = given.left[:, own].mT @ view.turns[:, driven.reference[own]].mT @ turn
+        after = turn.mT @ view.turns[:, limb.end] @ given.right[:, end]
+        conjugate = about * about.new_tensor([1.0, -1.0, -1.0, -1.0])
+        read = (
+            (matrix_to_quaternion(before), about, matrix_to_quaternion(given.right[:, own]), own),
+            (matrix_to_quaternion(given.left[:, end].mT), conjugate, matrix_to_quaternion(after), end),
         )
-        energy = 2 * (change * view.residual[:, None, limb.clouds]).sum((-3, -2, -1))
-        first, second = change[:, :, limb.first], change[:, :, limb.second]
-        both = ((first @ rest.second[:, None, limb.pairs]) * second).sum((-2, -1))
-        return energy + (both * torch.where(limb.first == limb.second, 1.0, 2.0).to(both)).sum(-1)
+        spins = []
+        for left, between, right, channel in read:
+            seen = _product(_product(left[:, None], between), right[:, None])
+            seen = torch.where(seen[..., :1] < 0, -seen, seen)
+            along = (seen[..., 1:] * given.axis[:, None, channel]).sum(-1)
+            twist = 4 * torch.atan2(along, 1 + seen[..., 0])
+            spins.append(twist[..., None] * driven.mix[limb.helpers, channel])
+        return spins[0] + spins[1]
 
     def _moves(self, limb: _Limb, angle: Tensor, relative: Tensor, view: View, scale: Tensor) -> Tensor:
         """Change (F, a) of the error by what the offsets do."""
@@ -234,8 +265,18 @@ class TwistShare:
         own = self.offsets.features(relative[:, limb.own, None] @ turn, limb.own)
         end = self.offsets.features(turn.mT @ relative[:, limb.end, None], limb.end)
         still = [self.offsets.features(relative[:, joint, None], joint) for joint in (limb.own, limb.end)]
-        seen = (own - still[0]) @ limb.by_own.T + (end - still[1]) @ limb.by_end.T
+        seen = torch.cat((own - still[0], end - still[1]), -1) @ torch.cat((limb.by_own, limb.by_end), 1).T
         before = view.activity.before[:, None, limb.ids]
-        moved = self.offsets.squashed(before + seen) - self.offsets.squashed(before)
-        square = ((moved @ limb.gram) * moved).sum(-1)
-        return 2 * (moved * view.pull[:, None, limb.ids]).sum(-1) + scale[:, None].square() * square
+        moved = self.offsets.squashed(seen.add_(before)).sub_(self.offsets.squashed(before))
+        square = (moved @ limb.shapes).square().sum(-1)
+        pulled = (moved @ view.pull[:, limb.ids, None]).squeeze(-1)
+        return 2 * pulled + scale[:, None].square() * square
+
+
+def _product(first: Tensor, second: Tensor) -> Tensor:
+    """Products of quaternions (..., 4) in the order w, x, y, z."""
+    a, u = first[..., :1], first[..., 1:]
+    b, v = second[..., :1], second[..., 1:]
+    u, v = torch.broadcast_tensors(u, v)
+    real = a * b - (u * v).sum(-1, keepdim=True)
+    return torch.cat((real, a * v + b * u + torch.linalg.cross(u, v, dim=-1)), -1)

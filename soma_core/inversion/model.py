@@ -11,17 +11,20 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from soma_core.geometry.sparse import SparseRows
 from soma_core.inversion.driven import DrivenJoints, rig_with_helpers
 from soma_core.inversion.gauss_newton import HINGE_STIFFNESS, GaussNewton, damped_inverse
 from soma_core.inversion.limbs import LimbStart, TwistShare
 from soma_core.inversion.moments import RestMoments, SkinMoments
 from soma_core.inversion.offsets import PoseOffsets
+from soma_core.inversion.priors import JointTerms
 from soma_core.inversion.problem import Activity, Pose, Problem, View
 from soma_core.inversion.start import ProcrustesStart
 from soma_core.inversion.structure import skin_structure
 from soma_core.inversion.tables import solver_tables
 from soma_core.kernels.model_residual import ModelResidual
 from soma_core.layer import SomaLayer
+from soma_core.rig.skeleton import Rig
 from soma_core.skeleton.identity import Identity
 
 if TYPE_CHECKING:
@@ -37,39 +40,49 @@ class PoseModel(torch.nn.Module):
         layer: the forward model.
         plain: skinning by the public joints alone, whatever the layer adds.
         warp: run the Warp twins.
+        some: ids of vertices that are looked at; None for all.
 
     Attributes:
         structure, moments, solver, start: of the rig; twist joints are joints of it.
+        fitted: (v,) bool, vertices that take part by default.
         driven: the twist joints; None without.
         offsets: what a pose adds to the rest shape; None without.
+        share: search of the limbs' twist; None where nothing but skinning tells it.
     """
 
-    def __init__(self, layer: SomaLayer, *, plain: bool, warp: bool) -> None:
+    def __init__(
+        self, layer: SomaLayer, *, plain: bool, warp: bool, some: np.ndarray | None = None
+    ) -> None:
         super().__init__()
         kind = {"dtype": layer.dtype, "device": layer.device}
         fitted = np.ones(layer.mesh.vertex_count, bool)
         fitted[layer.mesh.face_interior] = False
-        twisting = layer.procedural and not plain
-        rig = rig_with_helpers(layer.rig) if twisting else layer.rig
-        self.rig, self.fitted = rig, fitted
-        self.animation = layer.posing if twisting else layer.animation
+        whole, twisting = layer.rig, layer.procedural and not plain
+        if some is not None:
+            fitted, whole = fitted[some], _rig_of(whole, some)
+        rig = rig_with_helpers(whole) if twisting else whole
+        self.fitted, self.some = fitted, None if some is None else torch.as_tensor(some, device=layer.device)
+        self.animation = layer.animation
         self.correctives = None if plain else layer.correctives
         self.structure = structure = skin_structure(rig, fitted)
-        self.driven = DrivenJoints(layer.rig, **kind) if twisting else None
+        self.driven = DrivenJoints(whole, **kind) if twisting else None
         self.moments = SkinMoments(structure, rig, warp=warp, **kind)
         self.solver = GaussNewton(structure, warp=warp, driven=self.driven, **kind)
-        limbs = None if self.driven is None else LimbStart(layer.rig, self.driven, structure.joints)
-        self.start = ProcrustesStart(structure, public_count=layer.rig.joint_count, limbs=limbs, **kind)
-        self.offsets = None
+        limbs = None if self.driven is None else LimbStart(whole, self.driven, structure.joints)
+        self.start = ProcrustesStart(
+            structure, public_count=whole.joint_count, limbs=limbs, warp=warp, **kind
+        )
+        self.offsets = self.share = None
         if self.correctives is not None:
-            self.offsets = PoseOffsets.of_correctives(self.correctives, rig, structure.joints, fitted, **kind)
-        self.share = None
-        if self.driven is not None and self.offsets is not None:
-            self.share = TwistShare(
-                layer.rig, self.driven, self.offsets, structure.joints, structure.pairs, fitted
+            self.offsets = PoseOffsets.of_correctives(
+                self.correctives, rig, structure.joints, fitted, some=some, **kind
             )
+            if self.driven is not None:
+                self.share = TwistShare(
+                    whole, self.driven, self.offsets, structure.joints, structure.pairs, fitted
+                )
+        self._warp, self._kind, self._skin = warp, kind, rig.weights
         self._steps = self._step_kernels() if self.solver.kernels is not None else None
-        self._warp, self._kind = warp, kind
         orient = rig.t_pose_world[:, :3, :3].copy()
         orient[0] = np.eye(3)
         self.register_buffer("orient", torch.as_tensor(orient).to(**kind), persistent=False)
@@ -78,7 +91,12 @@ class PoseModel(torch.nn.Module):
     def residual(self) -> ModelResidual:
         """Compares poses with targets; made when first asked for."""
         shapes = None if self.offsets is None else self.offsets.shapes
-        return ModelResidual(self.animation.posed_skinning.weights.csr, shapes, warp=self._warp, **self._kind)
+        skin = SparseRows(self._skin, **self._kind).csr
+        return ModelResidual(skin, shapes, warp=self._warp, **self._kind)
+
+    def seen(self, identity: Identity) -> Identity:
+        """The identity with the vertices that are looked at."""
+        return identity if self.some is None else replace(identity, rest=identity.rest[:, self.some])
 
     def _step_kernels(self) -> PoseSolver:
         from soma_core.kernels.pose_solver_wp import PoseSolver
@@ -100,6 +118,46 @@ class PoseModel(torch.nn.Module):
         own = self.driven.offsets(identity.bind_world, bone_scale)
         batch = max(len(offsets), len(own))
         return torch.cat((offsets.expand(batch, -1, 3), own.expand(batch, -1, 3)), 1)
+
+    def problem(
+        self,
+        vertices: Tensor,
+        identity: Identity,
+        weights: Tensor,
+        bone_scale: Tensor | None,
+        terms: JointTerms | None,
+        rest: RestMoments | None,
+    ) -> Problem:
+        """The problem of some frames for this model.
+
+        Args:
+            vertices: (F, v, 3) [m] of the whole mesh, finite.
+            identity: batch of 1 or F.
+            weights: (1 or F, v).
+            bone_scale: (1 or F, J - 1); None without.
+            terms: soft terms and hinges.
+            rest: of the one identity, where it is known already.
+        """
+        if self.some is not None:
+            vertices, weights = vertices[:, self.some], weights[:, self.some]
+        seen = self.seen(identity)
+        if rest is None and (identity.batch_size > 1 or len(weights) > 1):
+            rest, target, origin = self.each(vertices, seen, weights, bone_scale)
+        else:
+            rest = self.rest(seen, weights, bone_scale) if rest is None else rest
+            if bone_scale is not None:
+                rest = replace(rest, offsets=self.bone_offsets(identity, bone_scale))
+            target, origin = self.moments.target(vertices, rest)
+        return Problem(
+            vertices=vertices, weights=weights, identity=seen, rest=rest, target=target, origin=origin,
+            bone_scale=bone_scale, terms=terms,
+        )  # fmt: skip
+
+    def prepared(self, identity: Identity, weights: Tensor) -> RestMoments:
+        """Moments of one identity of the whole mesh, for :meth:`problem`."""
+        if self.some is not None:
+            weights = weights[:, self.some]
+        return self.rest(self.seen(identity), weights)
 
     def rest(self, identity: Identity, weights: Tensor, bone_scale: Tensor | None = None) -> RestMoments:
         """Moments of identities under vertex weights (1 or i, v)."""
@@ -227,3 +285,13 @@ class PoseModel(torch.nn.Module):
         return matrix + self.offsets.matrix(
             view.activity, pose.relative, view.turns, view.places, self.solver, fold, scale
         )
+
+
+def _rig_of(rig: Rig, some: np.ndarray) -> Rig:
+    """The rig of a part of the vertices."""
+    procedural = rig.procedural
+    if procedural is not None:
+        procedural = replace(procedural, weights=procedural.weights[some])
+    return replace(
+        rig, bind_shape=rig.bind_shape[some], weights=rig.weights[some], procedural=procedural
+    )

@@ -26,7 +26,7 @@ from soma_core.rig.skeleton import Rig
 
 __all__ = ["PoseOffsets"]
 
-_LEAST_MODE = 3e-5
+_LEAST_MODE = 1e-4
 """Root mean square motion of all vertices [m] below which a mode of one joint's shapes is left out."""
 
 
@@ -91,9 +91,17 @@ class PoseOffsets(torch.nn.Module):
 
     @classmethod
     def of_correctives(
-        cls, correctives: Correctives, rig: Rig, joints: np.ndarray, fitted: np.ndarray, *, dtype, device
+        cls,
+        correctives: Correctives,
+        rig: Rig,
+        joints: np.ndarray,
+        fitted: np.ndarray,
+        *,
+        some: np.ndarray | None = None,
+        dtype: torch.dtype,
+        device: torch.device | str,
     ) -> PoseOffsets:
-        """Those of a layer's correctives; `rig` and `joints` as of the class, with the twist joints."""
+        """Those of a layer's correctives, on the vertices `some`; the rest as of the class."""
         features = correctives.features
         left, right = (
             np.concatenate([np.zeros((1, 3, 3)), part.double().cpu().numpy()])
@@ -102,6 +110,8 @@ class PoseOffsets(torch.nn.Module):
         still = np.broadcast_to(np.eye(3)[:, :2], (len(left), 3, 2)).copy()
         still[0] = 0
         first, second = (_matrix(rows) for rows in (correctives.first, correctives.second))
+        if some is not None:
+            second = second[(3 * some[:, None] + np.arange(3)).ravel()]
         return cls(
             left=left, right=right, still=still, first=first, squash=correctives.use_tanh, shapes=second,
             owner=correctives.owner, rig=rig, joints=joints, fitted=fitted, dtype=dtype, device=device,
@@ -130,7 +140,10 @@ class PoseOffsets(torch.nn.Module):
         return turned.flatten(-2)
 
     def seen_by(self, own: int, end: int, fitted: np.ndarray) -> dict[str, Tensor]:
-        """Activations that read either of two joints: their ids, how they read them, and products of shapes."""
+        """Activations that read either of two joints: their ids, how they read them, and their shapes.
+
+        Shapes come in coordinates (c, r) of their own, of which small ones are left out.
+        """
         width = 3 * self.columns
         reads = self.gate.new_zeros(self.shapes.shape[1] + 1, 2, width)
         for which, joint in enumerate((own, end)):
@@ -139,8 +152,13 @@ class PoseOffsets(torch.nn.Module):
         ids = torch.nonzero((reads[:-1] != 0).any(-1).any(-1)).flatten()
         shapes = _matrix(self.shapes)[:, ids.cpu().numpy()]
         counted = scipy.sparse.diags_array(np.repeat(fitted.astype(np.float64), 3)) @ shapes
-        gram = torch.as_tensor((shapes.T @ counted).toarray()).to(reads)
-        return {"ids": ids, "by_own": reads[ids, 0], "by_end": reads[ids, 1], "gram": gram}
+        values, vectors = np.linalg.eigh((shapes.T @ counted).toarray())
+        kept = values > fitted.sum() * _LEAST_MODE**2
+        coordinates = vectors[:, kept] * np.sqrt(values[kept])
+        return {
+            "ids": ids, "by_own": reads[ids, 0], "by_end": reads[ids, 1],
+            "shapes": torch.as_tensor(coordinates).to(reads),
+        }  # fmt: skip
 
     def slopes(self, pull: Tensor, activity: Activity, relative: Tensor, above: Tensor) -> Tensor:
         """Derivative (F, J, 3) by world turns of each joint, from that by activations (F, C).

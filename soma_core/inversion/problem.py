@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -11,7 +11,7 @@ from soma_core.inversion.moments import RestMoments
 from soma_core.inversion.priors import JointTerms
 from soma_core.skeleton.identity import Identity
 
-__all__ = ["Activity", "Pose", "Problem", "View"]
+__all__ = ["Activity", "Pose", "Problem", "View", "part_of"]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -38,6 +38,29 @@ class Problem:
     bone_scale: Tensor | None = None
     terms: JointTerms | None = None
 
+    def part(self, rows: Tensor) -> Problem:
+        """The problem of some of its frames."""
+        count = len(self.vertices)
+
+        def own(value):
+            return value[rows] if isinstance(value, Tensor) and len(value) == count > 1 else value
+
+        rest, identity, terms = self.rest, part_of(self.identity, rows), self.terms
+        if rest.batch_size > 1:
+            driven = rest.driven
+            if driven is not None:
+                driven = replace(driven, **{name: own(value) for name, value in vars(driven).items()})
+            parts = {name: own(value) for name, value in vars(rest).items() if name != "driven"}
+            rest = replace(rest, **parts, driven=driven)
+        elif len(rest.offsets) > 1:
+            rest = replace(rest, offsets=own(rest.offsets))
+        if terms is not None:
+            terms = replace(terms, reference=own(terms.reference))
+        return replace(
+            self, vertices=self.vertices[rows], weights=own(self.weights), identity=identity, rest=rest,
+            target=self.target[rows], origin=self.origin[rows], bone_scale=own(self.bone_scale), terms=terms,
+        )  # fmt: skip
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Pose:
@@ -55,6 +78,15 @@ class Pose:
     translation: Tensor
     accepted: Tensor
     last_change: Tensor
+
+    def part(self, rows: Tensor) -> Pose:
+        """Poses of some frames."""
+        return Pose(**{name: value[rows] for name, value in vars(self).items()})
+
+    def put(self, rows: Tensor, part: Pose) -> Pose:
+        """These poses with those of some frames replaced."""
+        old = vars(self)
+        return Pose(**{name: old[name].index_copy(0, rows, value) for name, value in vars(part).items()})
 
     @classmethod
     def begin(cls, relative: Tensor, translation: Tensor) -> Pose:
@@ -103,3 +135,17 @@ class View:
     turns: Tensor
     places: Tensor
     activity: Activity | None
+
+
+def part_of(identity: Identity, chunk: slice | Tensor) -> Identity:
+    """The identities of a chunk of frames; one identity serves every chunk."""
+    if identity.batch_size == 1:
+        return identity
+    return replace(
+        identity,
+        rest=identity.rest[chunk],
+        bind_world=identity.bind_world[chunk],
+        fitted_rest=identity.fitted_rest[chunk],
+        fitted_world=identity.fitted_world[chunk],
+        params={name: value[chunk] for name, value in identity.params.items()},
+    )

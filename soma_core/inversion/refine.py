@@ -26,6 +26,9 @@ _LOWER, _RAISE, _LEAST_RAISED, _MOST_DAMPING = 0.1, 10.0, 1e-4, 1e4
 """Levenberg damping relative to the diagonal: start, factors after a good and a bad step, least value after a
 bad one, largest."""
 
+_FACTORISED = (0, 1, 3)
+"""Steps at which the matrix is made anew; in between, the memory makes up for what changes."""
+
 _NOISE = {torch.float32: 1e-6, torch.float64: 1e-14}
 """Relative rounding of an energy."""
 
@@ -78,33 +81,36 @@ class Refinement:
         self.model, self.problem, self.bound = model, problem, bound
         self.mass = problem.weights.sum(1).expand(len(problem.vertices))
 
-    def __call__(self, start: Pose, *, iterations: int, tolerance: float) -> Pose:
-        """Refine poses.
+    def __call__(self, start: Pose, *, iterations: int, tolerance: float, share: float = 0.0) -> Pose:
+        """Refine poses; `last_change` becomes zero where a frame rests, else what its Newton step would do.
 
         Args:
             start: where to begin, about the problem's origin.
-            iterations: largest number of evaluations of the model after the first.
+            iterations: largest number of steps.
             tolerance: a frame rests once its Newton decrement, as a root mean square change of the vertices,
-                is below this [m].
+                is below this [m],
+            share: or below this share of the error that is left.
         """
         solver = self.model.solver
         pose, view = start, self._view(start)
         damping = torch.full_like(self.mass, _START_DAMPING)
         moving = torch.ones_like(start.accepted, dtype=torch.bool)
-        none = view.slope.new_zeros(len(moving), 0, view.slope[0].numel())
+        shape = view.slope.shape
+        none = view.slope.new_zeros(shape[0], 0, shape[1] * shape[2])
         memory = _Memory(steps=none, changes=none)
-        solve = self.model.inverse(self.problem, pose, view, damping, self.mass)
         floor = _FLOOR[self.mass.dtype] ** 2 * self.mass
-        for count in range(iterations):
-            if count:
+        solve = None
+        for count in range(iterations + 1):
+            if solve is None or count in _FACTORISED:
                 solve = self.model.inverse(self.problem, pose, view, damping, self.mass)
-            shape = view.slope.shape
             step = -memory.direction(view.slope.flatten(1), lambda one, to=solve: to(one.view(shape)).flatten(1))
             step = solver.shortened(step.view(shape), view.turns, self.problem.terms)
             decrement = (-(step * view.slope).sum((1, 2)).clamp_max(0) / self.mass).sqrt()
-            pose = replace(pose, last_change=torch.where(moving, decrement, pose.last_change))
-            moving = moving & ~(decrement < tolerance)
-            if not bool(moving.any()):
+            enough = torch.clamp((view.energy / self.mass).sqrt() * share, min=tolerance)
+            moving = moving & ~(decrement < enough)
+            last = torch.where(moving, decrement, torch.zeros_like(decrement))
+            pose = replace(pose, last_change=last)
+            if count == iterations or not bool(moving.any()):
                 break
             trial = solver.retract(pose, view.turns, step)
             seen = self._view(trial)
@@ -119,6 +125,8 @@ class Refinement:
             view = _chosen_view(better, seen, view)
             lower, higher = damping * _LOWER, (damping * _RAISE).clamp(_LEAST_RAISED, _MOST_DAMPING)
             damping = torch.where(better, lower, higher)
+            if bool((moving & ~better).any()):
+                solve = None
         return pose
 
     def _view(self, pose: Pose) -> View:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from soma_core.inversion.comparison import part_of
+from soma_core.inversion.problem import part_of
 from soma_core.inversion.fit import PoseInversion
 from soma_core.inversion.moments import RestMoments
 from soma_core.inversion.problem import Pose

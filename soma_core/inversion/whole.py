@@ -1,0 +1,153 @@
+"""The way down on the full model: twist joints and correctives, or residuals that are clipped."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from soma_core.inversion.model import PoseModel
+from soma_core.inversion.problem import Pose, Problem
+from soma_core.inversion.refine import Refinement
+
+if TYPE_CHECKING:
+    from soma_core.inversion.ladder import LadderOptions, Targets
+
+__all__ = ["WholeFit"]
+
+_ROUNDS, _STEPS = 2, 5
+"""How often offsets and the limbs' twist are looked at before the descent, and steps on moments after each."""
+
+_RESTING, _RESTING_SHARE = 1.5e-7, 3e-4
+"""A frame rests where a Newton step would change it by less, as a root mean square of its vertices [m], or
+relative to the error that is left."""
+
+_BURST = 6
+"""Steps after which frames that rest are left alone."""
+
+_SAMPLED = 8
+"""Every so many vertices have a say in a frame's median residual."""
+
+_DOUBTFUL = (1e-6, 3e-4)
+"""A root mean square error [m] between these is more than rounding and less than noise: such a frame may rest in
+a fold of the correctives beside its minimum, and is tried from further limb twists."""
+
+_TRIED = (0.2, -0.2, 0.45, -0.45)
+"""Those twists, against what was found [rad]."""
+
+
+class WholeFit:
+    """From a pose fitted to moments of skinning to the minimum of the whole model.
+
+    Args:
+        coarse: the model on few vertices, for the way; it may be `model`.
+        model: the one that is fitted.
+        options: of the ladder.
+    """
+
+    def __init__(self, coarse: PoseModel, model: PoseModel, options: LadderOptions) -> None:
+        self.coarse, self.model, self.options = coarse, model, options
+
+    def __call__(self, targets: Targets, pose: Pose) -> tuple[Pose, Problem]:
+        """The pose, its translation in the world, and the problem of the model.
+
+        Args:
+            targets: what to fit.
+            pose: where to begin, in the world.
+        """
+        problem = targets.problem(self.coarse)
+        steps = pose.accepted
+        pose = replace(pose, translation=pose.translation - problem.origin)
+        pose, bound = self._approached(problem, pose)
+        pose = self._descended(self.coarse, problem, pose, bound)
+        if self.options.robust is None:
+            pose = self._searched(problem, pose)
+        if self.coarse is not self.model:
+            world = pose.translation + problem.origin
+            problem = targets.problem(self.model)
+            pose = replace(pose, translation=world - problem.origin)
+            if bound is not None:
+                bound = self._bound(self.model, problem, pose)
+            pose = self._descended(self.model, problem, pose, bound)
+        accepted = steps + pose.accepted
+        return replace(pose, translation=pose.translation + problem.origin, accepted=accepted), problem
+
+    def _approached(self, problem: Problem, pose: Pose) -> tuple[Pose, Tensor | None]:
+        """Offsets, clips and the limbs' twist are looked at in turns with steps on moments."""
+        model, robust = self.coarse, self.options.robust is not None
+        rounds, bound = self.options.robust_rounds if robust else _ROUNDS, None
+        for _ in range(rounds):
+            if robust:
+                bound = self._bound(model, problem, pose)
+            pose = self._shared(problem, pose, bound)
+            view = model.view(problem, pose, bound)
+            pose = model.solver(
+                problem.target, problem.rest, pose, iterations=_STEPS, tolerance=self.options.tolerance,
+                terms=problem.terms, residual=view.residual,
+            )  # fmt: skip
+        return replace(pose, accepted=torch.zeros_like(pose.accepted)), bound
+
+    def _shared(self, problem: Problem, pose: Pose, bound: Tensor | None) -> Pose:
+        share = self.coarse.share
+        if share is None:
+            return pose
+        view = self.coarse.view(problem, pose, bound)
+        scale = self.coarse.scale(problem).expand(len(pose.translation))
+        return share(pose, view, problem.rest, scale, self._held(problem))
+
+    def _held(self, problem: Problem) -> frozenset[int]:
+        """Joints that are hinges."""
+        if problem.terms is None:
+            return frozenset()
+        hinged = (problem.terms.hinge_axis != 0).any(-1)
+        return frozenset(self.coarse.solver.variables[hinged].tolist())
+
+    def _bound(self, model: PoseModel, problem: Problem, pose: Pose) -> Tensor:
+        """Length (F,) [m] beyond which residuals count linearly."""
+        assert self.options.robust is not None
+        distances, _ = model.distances(problem, pose)
+        assert distances is not None
+        counted = (problem.weights > 0).expand_as(distances)[:, ::_SAMPLED]
+        typical = distances[:, ::_SAMPLED].masked_fill(~counted, torch.nan).nanmedian(1).values
+        return (2 * typical.nan_to_num(0.0)).clamp_min(self.options.robust)
+
+    def _descended(self, model: PoseModel, problem: Problem, pose: Pose, bound: Tensor | None) -> Pose:
+        """Descent on the model; frames that rest are left alone."""
+        rows = torch.arange(len(pose.accepted), device=pose.accepted.device)
+        pose = replace(pose, last_change=torch.full_like(pose.last_change, torch.inf))
+        for done in range(0, self.options.refreshes, _BURST):
+            if not len(rows):
+                break
+            every = len(rows) == len(pose.accepted)
+            part = problem if every else problem.part(rows)
+            refinement = Refinement(model, part, bound if bound is None or every else bound[rows])
+            steps = min(_BURST, self.options.refreshes - done)
+            found = refinement(
+                pose if every else pose.part(rows), iterations=steps, tolerance=_RESTING, share=_RESTING_SHARE
+            )
+            pose = found if every else pose.put(rows, found)
+            rows = rows[found.last_change > 0]
+        return pose
+
+    def _searched(self, problem: Problem, pose: Pose) -> Pose:
+        """Frames that may rest beside their minimum are tried from other limb twists."""
+        share = self.coarse.share
+        if share is None:
+            return pose
+        for limb in share.free(self._held(problem)):
+            for angle in _TRIED:
+                _, energy = self.coarse.distances(problem, pose, energy_only=True)
+                error = (energy / problem.weights.sum(1)).sqrt()
+                rows = torch.nonzero((error > _DOUBTFUL[0]) & (error < _DOUBTFUL[1])).flatten()
+                if not len(rows):
+                    return pose
+                part, old = problem.part(rows), pose.part(rows)
+                relative = old.relative.clone()
+                share.turn(relative, limb, relative.new_full((len(rows),), angle))
+                trial = self._descended(self.coarse, part, replace(old, relative=relative), None)
+                _, reached = self.coarse.distances(part, trial, energy_only=True)
+                better = reached < 0.9 * energy[rows]
+                pose = pose.put(rows[better], trial.part(better))
+        return pose
