@@ -33,6 +33,12 @@ _INNER = (0.2, 0.8)
 _MARGIN = 0.05
 """Distance kept from half a turn, where a twist angle jumps [rad]."""
 
+_CLEAR = .08
+"""Cosine of half a joint's angle that a search keeps: twists jump where it is zero, and no step leads across."""
+
+_DEAR = 5e-4
+"""What it costs a share to come closer, as a root mean square error [m]."""
+
 _SHARES = 25
 """Shares looked at, evenly over a whole turn."""
 
@@ -219,8 +225,9 @@ class TwistShare:
         Helpers lie on the bone, so that each turns in place by one angle, and the error is a polynomial in its
         sine and cosine.
         """
-        spin = self._spins(limb, angle, view, rest) - self._spins(limb, angle[:1] * 0, view, rest)
-        spin = spin + angle[:, None]  # (F, a, h)
+        mix = self.driven.mix[limb.helpers][:, list(limb.channels)].T
+        twists, clear = self._twists(limb, torch.cat((angle, angle[:1] * 0)), view, rest)  # (F, a + 1, 2)
+        spin = (twists[:, :-1] - twists[:, -1:]) @ mix + angle[:, None]  # (F, a, h)
         across = skew(limb.axis)
         turns = view.turns[:, self.driven.public_count + limb.helpers]
         basis = torch.stack((turns @ across, turns @ (across @ across)), 2)  # (F, h, 2, 3, 3)
@@ -232,10 +239,17 @@ class TwistShare:
         product = torch.einsum("fqxab,fqyab->fqxy", moved, second)
         product = product * torch.where(limb.first == limb.second, 1.0, 2.0).to(product)[:, None, None]
         both = torch.einsum("faqx,fqxy->faqy", part[:, :, limb.first], product)
-        return energy + (both * part[:, :, limb.second]).sum((-2, -1))
+        energy = energy + (both * part[:, :, limb.second]).sum((-2, -1))
+        jumping = (clear[:, :-1] < _CLEAR).any(-1)
+        return energy + jumping * (_DEAR**2 * rest.own[..., 3, 3].sum(1))[:, None]
 
-    def _spins(self, limb: _Limb, angle: Tensor, view: View, rest: RestMoments) -> Tensor:
-        """Angles (F, a, h) of the helpers when the bone turns by each `angle` (a,)."""
+    def _twists(
+        self, limb: _Limb, angle: Tensor, view: View, rest: RestMoments
+    ) -> tuple[Tensor, Tensor]:
+        """Twists (F, a, 2) of the bone and of the next one when the bone turns by each `angle` (a,).
+
+        Beside them, how far each joint is from half a turn, as the cosine of half its angle.
+        """
         driven, given = self.driven, rest.driven
         assert given is not None
         own, end = limb.channels
@@ -249,14 +263,14 @@ class TwistShare:
             (matrix_to_quaternion(before), about, matrix_to_quaternion(given.right[:, own]), own),
             (matrix_to_quaternion(given.left[:, end].mT), conjugate, matrix_to_quaternion(after), end),
         )
-        spins = []
+        twists, cosines = [], []
         for left, between, right, channel in read:
             seen = _product(_product(left[:, None], between), right[:, None])
             seen = torch.where(seen[..., :1] < 0, -seen, seen)
             along = (seen[..., 1:] * given.axis[:, None, channel]).sum(-1)
-            twist = 4 * torch.atan2(along, 1 + seen[..., 0])
-            spins.append(twist[..., None] * driven.mix[limb.helpers, channel])
-        return spins[0] + spins[1]
+            twists.append(4 * torch.atan2(along, 1 + seen[..., 0]))
+            cosines.append(seen[..., 0])
+        return torch.stack(twists, -1), torch.stack(cosines, -1)
 
     def _moves(self, limb: _Limb, angle: Tensor, relative: Tensor, view: View, scale: Tensor) -> Tensor:
         """Change (F, a) of the error by what the offsets do."""
