@@ -5,10 +5,9 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from soma_core.inversion.problem import part_of
 from soma_core.inversion.fit import PoseInversion
 from soma_core.inversion.moments import RestMoments
-from soma_core.inversion.problem import Pose
+from soma_core.inversion.problem import Pose, part_of
 from soma_core.inversion.result import InversionResult
 from soma_core.skeleton.identity import Identity
 
@@ -37,7 +36,7 @@ def shape_normal_equations(
 
     Column i of J is the motion of all vertices from the first identity to identity i + 1, over ``steps[i]``,
     after every frame has turned its joints so as to undo it as well as it can (Schur complement); in that,
-    skin follows the public joints alone. In float64, not divided by anything.
+    correctives stay as they are. In float64, not divided by anything.
 
     Args:
         inversion: the pose fit.
@@ -73,17 +72,15 @@ def _followed(
     inversion: PoseInversion, rest: RestMoments, turn: Tensor, place: Tensor, fields: Tensor
 ) -> Tensor:
     """``L^-1 J^T D`` (n, k) of displacement fields D (k, v, 3) of a frame, ``L L^T = J^T J`` of its pose."""
-    solver, moments = inversion.ladder.solver, inversion.moments
+    solver, moments = inversion.model.solver, inversion.model.moments
     eye = solver.eye.expand(1, 1, 3, 3)
     turns, places = solver.walk(Pose.begin(torch.cat((eye, turn), 1), place), rest)
-    none = torch.zeros_like(rest.own[..., :3, :])
-    matrix, _ = solver.normal_equations(turns, places, rest.second, none)
+    matrix, _ = solver.normal_equations(turns, places, rest)
     dense = matrix.flatten(3, 4).flatten(1, 2)[0].double()
     diagonal = dense.diagonal()
     dense = dense + torch.diag(_DAMPING * diagonal + _RIDGE * diagonal.mean())
-    field_moments, origin = moments.target(fields, rest)
-    field_moments = field_moments + origin[:, None, :, None] * rest.own[:, :, 3, :][:, :, None]
     count = len(fields)
-    slopes = solver.slopes(turns.expand(count, -1, 3, 3), places.expand(count, -1, 3), field_moments)
+    turns, places = turns.expand(count, -1, 3, 3), places.expand(count, -1, 3)
+    slopes = solver.slopes(turns, places, rest, moments.of_vectors(fields, rest))
     factor = torch.linalg.cholesky(dense)
     return torch.linalg.solve_triangular(factor, slopes.flatten(1).double().T, upper=False)

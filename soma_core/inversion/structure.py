@@ -7,10 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.sparse
 
-from soma_core.rig.mesh import CanonicalMesh
 from soma_core.rig.skeleton import Rig
 
-__all__ = ["MomentStructure", "moment_structure", "skin_structure"]
+__all__ = ["MomentStructure", "skin_structure"]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -51,13 +50,6 @@ class MomentStructure:
                 above[step, joint] = True
                 step = self.parents[step]
         return above
-
-
-def moment_structure(mesh: CanonicalMesh, rig: Rig) -> MomentStructure:
-    """The structure of the canonical rig: all influences outside the face interior."""
-    fitted = np.ones(mesh.vertex_count, bool)
-    fitted[mesh.face_interior] = False
-    return skin_structure(rig, fitted)
 
 
 def skin_structure(rig: Rig, fitted: np.ndarray) -> MomentStructure:

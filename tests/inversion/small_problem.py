@@ -14,14 +14,14 @@ from soma_core.geometry.rotations import axis_angle_to_matrix
 from soma_core.inversion.gauss_newton import GaussNewton
 from soma_core.inversion.moments import RestMoments, SkinMoments
 from soma_core.inversion.problem import Pose
-from soma_core.inversion.structure import MomentStructure, moment_structure
+from soma_core.inversion.structure import MomentStructure, skin_structure
 from soma_core.rig import load_canonical
 from soma_core.rig.mesh import CanonicalMesh
 from soma_core.rig.skeleton import Rig
 from soma_core.skeleton.identity import Identity
 from tests.bodies import CPU, randn, tiny_canonical
 
-__all__ = ["Body", "part", "pose_about", "real", "synthetic"]
+__all__ = ["Body", "canonical_structure", "part", "pose_about", "real", "synthetic"]
 
 
 @functools.cache
@@ -46,7 +46,7 @@ class Body:
     @functools.cached_property
     def structure(self) -> MomentStructure:
         """Index lists of the rig."""
-        return moment_structure(self.mesh, self.rig)
+        return canonical_structure(self.mesh, self.rig)
 
     @functools.cached_property
     def skin_weights(self) -> np.ndarray:
@@ -120,6 +120,13 @@ class Body:
         """All joints at T-pose, the Hips at the origin of each frame."""
         eye = torch.eye(3, dtype=dtype).repeat(count, self.rig.joint_count, 1, 1)
         return Pose.begin(eye, torch.zeros(count, 3, dtype=dtype))
+
+
+def canonical_structure(mesh: CanonicalMesh, rig: Rig) -> MomentStructure:
+    """Index lists of a rig: all influences outside the face interior."""
+    fitted = np.ones(mesh.vertex_count, bool)
+    fitted[mesh.face_interior] = False
+    return skin_structure(rig, fitted)
 
 
 def pose_about(rotations: Tensor, hips: Tensor, origin: Tensor) -> Pose:

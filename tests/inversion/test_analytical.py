@@ -66,7 +66,7 @@ def procrustes(case):
     body = case.body
     relative = ProcrustesStart(body.structure, dtype=case.target.dtype, device=CPU)(case.target, case.rest)
     pose = replace(case.start, relative=relative, translation=torch.zeros_like(case.origin))
-    turns, places = body.solver().walk(pose, case.rest.offsets)
+    turns, places = body.solver().walk(pose, case.rest)
     joints = body.structure.joints
     shift = best_translation(case.target, case.rest, turns[:, joints], places[:, joints])
     return replace(pose, translation=shift)

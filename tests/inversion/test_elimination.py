@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from soma_core.inversion.elimination import elimination_plan
-from soma_core.inversion.structure import moment_structure
 from soma_core.rig import load_canonical
 from tests.bodies import tiny_canonical
+from tests.inversion.small_problem import canonical_structure
 
 ROUNDING = 1e-12
 """Relative; block sums run in another order than dense ones."""
@@ -24,15 +24,15 @@ def random_structure(seed):
     joints = joints[joints > 0] if (joints > 0).any() else np.array([count - 1])
     shared = np.triu(random.uniform(size=(len(joints),) * 2) < 0.2) | np.eye(len(joints), dtype=bool)
     structure = replace(
-        moment_structure(*tiny_canonical()), parents=parents, joints=joints, pairs=np.argwhere(shared)
+        canonical_structure(*tiny_canonical()), parents=parents, joints=joints, pairs=np.argwhere(shared)
     )
     below = structure.ancestors[:, joints].any(1)
     return replace(structure, variables=np.flatnonzero(below)[np.flatnonzero(below) > 0])
 
 
 def structures():
-    yield pytest.param(lambda: moment_structure(*tiny_canonical()), id="synthetic")
-    yield pytest.param(lambda: moment_structure(*load_canonical("low")), id="low")
+    yield pytest.param(lambda: canonical_structure(*tiny_canonical()), id="synthetic")
+    yield pytest.param(lambda: canonical_structure(*load_canonical("low")), id="low")
     for seed in range(12):
         yield pytest.param(functools.partial(random_structure, seed), id=f"random{seed}")
 

@@ -118,7 +118,7 @@ def test_normal_equations_are_those_of_automatic_differentiation():
     found = dense_model(given, rotations[0], hips[0])[fitted]
     torch.testing.assert_close(found, expected, atol=1e-12, rtol=0)
     solver, rest = given.body.solver(), given.rest
-    turns, places = solver.walk(given.about(rotations, hips), rest.offsets)
+    turns, places = solver.walk(given.about(rotations, hips), rest)
     n = solver.variables
     above = turns[0, solver.parents[n]]
 
@@ -132,7 +132,7 @@ def test_normal_equations_are_those_of_automatic_differentiation():
     jacobian = torch.func.jacfwd(residual)(zero).flatten(0, 1).flatten(1)
     expected = jacobian.T @ jacobian, jacobian.T @ residual(zero).flatten()
     half_gradient = solver.gradient(turns, places, solver.dense(rest.second), given.target)
-    matrix, slope = solver.normal_equations(turns, places, rest.second, half_gradient)
+    matrix, slope = solver.normal_equations(turns, places, rest, half_gradient)
     found = matrix.reshape(expected[0].shape), slope.flatten()
     for mine, theirs in zip(found, expected, strict=True):
         torch.testing.assert_close(mine, theirs, atol=EXACT * float(theirs.abs().max()), rtol=0)
@@ -189,9 +189,9 @@ def test_with_noise_the_result_is_stationary(dtype, warp):
     found = given.solve(given.about(*given.body.poses(FRAMES, dtype=dtype)), warp=warp, iterations=40)
     rotations, hips = found.relative[:, 1:].double(), found.translation.double() + given.origin.double()
     solver = exact.body.solver()
-    turns, places = solver.walk(exact.about(rotations, hips), exact.rest.offsets)
+    turns, places = solver.walk(exact.about(rotations, hips), exact.rest)
     half_gradient = solver.gradient(turns, places, solver.dense(exact.rest.second), exact.target)
-    matrix, slope = solver.normal_equations(turns, places, exact.rest.second, half_gradient)
+    matrix, slope = solver.normal_equations(turns, places, exact.rest, half_gradient)
     diagonal = matrix.flatten(3).flatten(1, 2).diagonal(dim1=1, dim2=2)
     gain = (slope.flatten(1).square() / diagonal / exact.weights.sum(1)).sqrt()
     assert gain.max() < REACHED_M[dtype]

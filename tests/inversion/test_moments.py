@@ -80,7 +80,7 @@ def test_at_a_pose_it_is_the_error_of_the_forward_model():
     vertices = BODY.posed(identity, rotations, hips) + 0.1 * randn(FRAMES, VERTICES, 3, seed=3)
     target, origin = BODY.moments().target(vertices, rest)
     pose = pose_about(rotations, hips, torch.zeros_like(origin))
-    turns, places = BODY.solver().walk(pose, rest.offsets)
+    turns, places = BODY.solver().walk(pose, rest)
     transforms = torch.cat((turns, places[..., None]), -1)[:, STRUCTURE.joints]
     found = quadratic(rest, target, origin, weights, transforms, vertices)
     expected = (weights * (BODY.posed(identity, rotations, hips) - vertices).square().sum(-1)).sum(1)
@@ -106,7 +106,7 @@ def test_local_points_follow_their_joint_at_any_pose():
     identity, (rotations, hips) = BODY.identities(1), BODY.poses(2)
     vertices = BODY.posed(identity, rotations, hips)
     pose = pose_about(rotations, hips, torch.zeros(2, 3, dtype=torch.float64))
-    turns, places = BODY.solver().walk(pose, BODY.rest(identity, BODY.plain_weights()).offsets)
+    turns, places = BODY.solver().walk(pose, BODY.rest(identity, BODY.plain_weights()))
     local = BODY.moments().local_points(identity)
     alone = np.flatnonzero(STRUCTURE.influence_weight > 1 - 1e-12)
     assert len(alone) > 20

@@ -44,7 +44,7 @@ def test_a_rigid_motion_of_the_bind_pose_is_found(start):
     vertices = identity.rest @ turn.transpose(-1, -2) + randn(FRAMES, 1, 3, seed=2)
     target, origin = targets(vertices, rest)
     pose = pose_about(start(target, rest)[:, 1:], torch.zeros_like(origin), torch.zeros_like(origin))
-    turns, _ = BODY.solver().walk(pose, rest.offsets)
+    turns, _ = BODY.solver().walk(pose, rest)
     joints = STRUCTURE.joints
     bind = identity.bind_world[:, joints, :3, :3] @ torch.tensor(BODY.rig.t_pose_world)[joints, :3, :3].mT
     torch.testing.assert_close(turns[:, joints], turn[:, None] @ bind, atol=EXACT, rtol=0)
@@ -89,7 +89,7 @@ def test_the_best_translation_leaves_no_mean_residual(rest):
     )
     target, origin = targets(vertices, rest)
     pose = pose_about(rotations, torch.zeros_like(hips), torch.zeros_like(hips))
-    turns, places = BODY.solver().walk(pose, rest.offsets)
+    turns, places = BODY.solver().walk(pose, rest)
     joints = STRUCTURE.joints
     shift = best_translation(target, rest, turns[:, joints], places[:, joints]) + origin
     fitted = torch.tensor(STRUCTURE.fitted)

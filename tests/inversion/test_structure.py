@@ -6,15 +6,15 @@ import numpy as np
 import pytest
 import scipy.sparse
 
-from soma_core.inversion.structure import moment_structure
 from soma_core.rig import load_canonical
 from tests.bodies import tiny_canonical
+from tests.inversion.small_problem import canonical_structure
 
 
 @pytest.fixture(scope="module", params=["synthetic", "low"])
 def body(request):
     mesh, rig = tiny_canonical() if request.param == "synthetic" else load_canonical("low")
-    return mesh, rig, moment_structure(mesh, rig)
+    return mesh, rig, canonical_structure(mesh, rig)
 
 
 def fitted_weights(mesh, rig):
@@ -79,7 +79,7 @@ def test_pair_influences_meet_at_one_vertex(body):
 def test_the_shipped_rig_has_few_pairs():
     """The counts behind a step of constant cost; eyes and finger ends carry no weight."""
     mesh, rig = load_canonical("low")
-    structure = moment_structure(mesh, rig)
+    structure = canonical_structure(mesh, rig)
     assert (len(structure.variables), len(structure.pairs)) == (62, 335)
     without = set(range(rig.joint_count)) - set(structure.variables) - {0}
     assert all(rig.joint_names[joint].endswith(("End", "Eye")) for joint in without)
@@ -97,8 +97,8 @@ def test_stored_zeros_and_weights_of_the_face_interior_are_no_influences():
         ),
         shape=weights.shape,
     ).tocsr()
-    changed = moment_structure(mesh, replace(rig, weights=stored))
-    reference = moment_structure(mesh, rig)
+    changed = canonical_structure(mesh, replace(rig, weights=stored))
+    reference = canonical_structure(mesh, rig)
     assert jaw not in changed.joints
     np.testing.assert_array_equal(changed.influence_vertex, reference.influence_vertex)
     np.testing.assert_array_equal(changed.pairs, reference.pairs)

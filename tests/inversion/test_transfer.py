@@ -109,7 +109,7 @@ def test_a_joint_without_children_is_turned_by_its_weighted_points():
     given = problem(body, vertices, weights=weights)
     nowhere = torch.zeros(1, 3, dtype=torch.float64)
     found = pose_about(transfer(body)(given)[:, 1:], nowhere, nowhere)
-    turns, _ = body.solver().walk(found, given.rest.offsets)
+    turns, _ = body.solver().walk(found, given.rest)
     jaw, structure = body.rig.joint_names.index("Jaw"), body.structure
     mine = structure.joints[structure.influence_joint] == jaw
     vertex = structure.influence_vertex[mine]
