@@ -134,20 +134,23 @@ class WholeFit:
     def _searched(self, problem: Problem, pose: Pose) -> Pose:
         """Frames that may rest beside their minimum are tried from other limb twists."""
         share = self.coarse.share
-        if share is None:
+        limbs = [] if share is None else share.free(self._held(problem))
+        if share is None or not limbs:
             return pose
-        for limb in share.free(self._held(problem)):
-            for angle in _TRIED:
-                _, energy = self.coarse.distances(problem, pose, energy_only=True)
-                error = (energy / problem.weights.sum(1)).sqrt()
-                rows = torch.nonzero((error > _DOUBTFUL[0]) & (error < _DOUBTFUL[1])).flatten()
-                if not len(rows):
-                    return pose
-                part, old = problem.part(rows), pose.part(rows)
-                relative = old.relative.clone()
+        mass = problem.weights.sum(1).expand(len(pose.accepted))
+        _, energy = self.coarse.distances(problem, pose, energy_only=True)
+        for angle in _TRIED:
+            error = (energy / mass).sqrt()
+            rows = torch.nonzero((error > _DOUBTFUL[0]) & (error < _DOUBTFUL[1])).flatten()
+            if not len(rows):
+                break
+            part, old = problem.part(rows), pose.part(rows)
+            relative = old.relative.clone()
+            for limb in limbs:
                 share.turn(relative, limb, relative.new_full((len(rows),), angle))
-                trial = self._descended(self.coarse, part, replace(old, relative=relative), None)
-                _, reached = self.coarse.distances(part, trial, energy_only=True)
-                better = reached < 0.9 * energy[rows]
-                pose = pose.put(rows[better], trial.part(better))
+            trial = self._descended(self.coarse, part, replace(old, relative=relative), None)
+            _, reached = self.coarse.distances(part, trial, energy_only=True)
+            better = reached < 0.9 * energy[rows]
+            pose = pose.put(rows[better], trial.part(better))
+            energy = energy.index_copy(0, rows[better], reached[better])
         return pose
