@@ -20,7 +20,7 @@ from soma_core.inversion.ladder import Ladder, LadderOptions, Stage, Targets
 from soma_core.inversion.model import PoseModel
 from soma_core.inversion.moments import RestMoments
 from soma_core.inversion.priors import PosePriors, joint_terms, neighbour_mean, with_references
-from soma_core.inversion.problem import Pose, part_of
+from soma_core.inversion.problem import Pose, Problem, part_of
 from soma_core.inversion.result import InversionResult, joined
 from soma_core.inversion.start import cloud_extent
 from soma_core.layer import Kernels, SomaLayer
@@ -284,17 +284,31 @@ class PoseInversion(torch.nn.Module):
         error = error.masked_fill_(~usable[:, None], torch.nan)
         if vertices is not frames.vertices:
             error.masked_fill_(~torch.isfinite(frames.vertices).all(-1), torch.nan)
+        determined = self._determined(extent > _COLLAPSED) & usable[:, None]
         resting = 0.0 if self.ladder.whole is not None else self.ladder.options.tolerance
         return InversionResult(
             rotations=relative[:, 1:],
             translation=translation,
             vertex_error=error,
             valid=usable,
-            determined=self._determined(extent > _COLLAPSED) & usable[:, None],
+            determined=determined,
             converged=((pose.last_change < resting) | (pose.last_change == 0)) & usable,
             iterations=pose.accepted,
             residual=(energy / mass).sqrt().masked_fill(~usable, torch.nan),
+            angle_std=self._angle_std(problem, near, energy).masked_fill(~determined, torch.nan),
         ), scale
+
+    def _angle_std(self, problem: Problem, pose: Pose, energy: Tensor) -> Tensor:
+        """Standard deviations (F, J - 1) [degrees] of joint angles, where the noise is what is left.
+
+        Weights count as inverse variances, up to a factor that is estimated.
+        """
+        variables = self.model.solver.variables
+        spare = 3 * (problem.weights > 0).sum(1) - 3 * (len(variables) + 1)
+        noise = torch.where(spare > 0, energy / spare.clamp_min(1), torch.nan)
+        angle = (self.model.angle_variance(problem, pose) * noise[:, None]).clamp_min(0).sqrt().rad2deg()
+        every = angle.new_full((len(angle), self.layer.rig.joint_count - 1), torch.nan)
+        return every.index_copy(1, variables - 1, angle)
 
     def _determined(self, kept: Tensor) -> Tensor:
         """(F, J - 1) from the weighted joints (F, T): whether the target determines a user joint."""

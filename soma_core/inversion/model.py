@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from soma_core.geometry.sparse import SparseRows
+from soma_core.inversion.curvature import SkinCurvature
 from soma_core.inversion.driven import DrivenJoints, rig_with_helpers
 from soma_core.inversion.gauss_newton import HINGE_STIFFNESS, GaussNewton, damped_inverse
 from soma_core.inversion.limbs import LimbStart, TwistShare
@@ -28,9 +29,12 @@ from soma_core.rig.skeleton import Rig
 from soma_core.skeleton.identity import Identity
 
 if TYPE_CHECKING:
-    from soma_core.kernels.pose_solver_wp import PoseSolver
+    from soma_core.kernels.pose_solver_wp import Factor, PoseSolver
 
 __all__ = ["PoseModel"]
+
+_RIDGE = 1e-9
+"""Added to the undamped matrix, relative to its mean diagonal, as in its factorisation by kernels."""
 
 
 class PoseModel(torch.nn.Module):
@@ -257,34 +261,72 @@ class PoseModel(torch.nn.Module):
             damping: (F,) relative to the diagonal.
             mass: (F,) sums of the vertex weights.
         """
-        terms = problem.terms
         if self._steps is None:
-            matrix = self.matrix(problem, pose, view)
-            if terms is not None:
-                self.solver.add_terms(matrix, torch.zeros_like(view.slope), pose.relative, view.turns, terms, mass)
+            matrix = self._with_terms(problem, pose, view.turns, view.places, view.activity)
             return damped_inverse(matrix, damping)
-        activity = scale = None
-        if view.activity is not None:
-            slope = view.activity.slope
-            activity = torch.ones_like(view.activity.value) if slope is None else slope
-            scale = self.scale(problem).expand(len(mass))
-        factor = self._steps.factorise(
-            self.solver.constants(problem.rest), pose.relative, pose.translation, damping, mass, activity, scale,
-            stiffness=HINGE_STIFFNESS, soft=self.solver.soft(terms, pose.translation),
-        )  # fmt: skip
-        steps = self._steps
+        steps, factor = self._steps, self._factor(problem, pose, view.activity, damping, mass)
         return lambda slope: steps.solve(factor, slope)
+
+    def angle_variance(self, problem: Problem, pose: Pose) -> Tensor:
+        """Mean square angle (F, n) [rad^2] of each variable's own turn under vertex noise of variance 1 m^2.
+
+        Traces of the 3 x 3 diagonal blocks of the inverse of the undamped matrix, terms included.
+        """
+        activity = None if self.offsets is None else self.offsets.activity(pose.relative)
+        none = torch.zeros_like(pose.translation[:, 0])
+        if self._steps is not None:
+            mass = problem.weights.sum(1).expand(len(none))
+            return self._steps.variances(self._factor(problem, pose, activity, none, mass))
+        dense = self._with_terms(problem, pose, *self.walk(pose, problem.rest), activity)
+        dense = dense.flatten(3, 4).flatten(1, 2)
+        diagonal = dense.diagonal(dim1=-2, dim2=-1)
+        diagonal += _RIDGE * diagonal.mean(1, keepdim=True)
+        factor, _ = torch.linalg.cholesky_ex(dense)
+        own = torch.cholesky_inverse(factor).diagonal(dim1=-2, dim2=-1)
+        return own.unflatten(1, (-1, 3)).sum(-1)[:, :-1]
+
+    def _factor(
+        self, problem: Problem, pose: Pose, activity: Activity | None, damping: Tensor, mass: Tensor
+    ) -> Factor:
+        """The damped matrix, terms included, factorised by kernels."""
+        assert self._steps is not None
+        slope = scale = None
+        if activity is not None:
+            slope = torch.ones_like(activity.value) if activity.slope is None else activity.slope
+            scale = self.scale(problem).expand(len(mass))
+        return self._steps.factorise(
+            self.solver.constants(problem.rest), pose.relative, pose.translation, damping, mass, slope, scale,
+            stiffness=HINGE_STIFFNESS, soft=self.solver.soft(problem.terms, pose.translation),
+        )  # fmt: skip
+
+    def _with_terms(
+        self, problem: Problem, pose: Pose, turns: Tensor, places: Tensor, activity: Activity | None
+    ) -> Tensor:
+        """Matrix (F, n + 1, 3, n + 1, 3) of the model and the terms."""
+        matrix = self._matrix(problem, pose, turns, places, activity)
+        if problem.terms is not None:
+            mass = problem.weights.sum(1).expand(len(turns))
+            slope = torch.zeros_like(matrix[:, 0, 0])
+            self.solver.add_terms(matrix, slope, pose.relative, turns, problem.terms, mass)
+        return matrix
+
+    def curvature(self, problem: Problem, pose: Pose) -> SkinCurvature:
+        """The exact curvature of the error at poses."""
+        return SkinCurvature(self, problem, pose)
 
     def matrix(self, problem: Problem, pose: Pose, view: View) -> Tensor:
         """Gauss-Newton matrix (F, n + 1, 3, n + 1, 3) of the whole model at a pose."""
-        matrix, _ = self.solver.normal_equations(view.turns, view.places, problem.rest)
-        if self.offsets is None or view.activity is None:
+        return self._matrix(problem, pose, view.turns, view.places, view.activity)
+
+    def _matrix(
+        self, problem: Problem, pose: Pose, turns: Tensor, places: Tensor, activity: Activity | None
+    ) -> Tensor:
+        matrix, _ = self.solver.normal_equations(turns, places, problem.rest)
+        if self.offsets is None or activity is None:
             return matrix
-        fold = None if self.driven is None else self.solver.fold(view.turns, problem.rest)
-        scale = self.scale(problem).expand(len(view.turns))
-        return matrix + self.offsets.matrix(
-            view.activity, pose.relative, view.turns, view.places, self.solver, fold, scale
-        )
+        fold = None if self.driven is None else self.solver.fold(turns, problem.rest)
+        scale = self.scale(problem).expand(len(turns))
+        return matrix + self.offsets.matrix(activity, pose.relative, turns, places, self.solver, fold, scale)
 
 
 def _rig_of(rig: Rig, some: np.ndarray) -> Rig:

@@ -29,6 +29,10 @@ class InversionResult:
         converged: (frames,) bool; the last accepted step no longer lowered the energy noticeably.
         iterations: (frames,) int, accepted steps.
         residual: root mean square of the weighted vertex error [m], (frames,); NaN where not valid.
+        angle_std: standard deviation of each joint's own rotation, (frames, J - 1) [degrees]: root mean
+            square angle that independent noise of the vertices, as large as the error left, turns the joint
+            by against its parent. To first order: many degrees say no more than that it is open. NaN
+            where the frame is not valid or the joint not determined.
     """
 
     rotations: Tensor
@@ -39,6 +43,7 @@ class InversionResult:
     converged: Tensor
     iterations: Tensor
     residual: Tensor
+    angle_std: Tensor
 
     def part(self, chunk: slice) -> InversionResult:
         """The result of a chunk of frames."""

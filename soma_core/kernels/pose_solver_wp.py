@@ -15,6 +15,7 @@ import warp as wp
 from torch import Tensor
 
 from soma_core.kernels import _solver_text as text
+from soma_core.kernels import _variance_text as variance
 from soma_core.kernels._lanes import in_threads, lane_count, to_lanes
 from soma_core.kernels._native import native, transposing
 from soma_core.kernels._runtime import as_warp, launching, scalar_name
@@ -61,6 +62,7 @@ def _slot_sizes(n: Mapping[str, int]) -> dict[str, int]:
         "soft_energy": 1, "scale": 1, "activity": n["activation_count"],
         "features": 9 * n["feature_columns"] * n["used_count"], "response": n["response_size"],
         "mode_rows": n["mode_rows"], "mode_tree": n["mode_tree"], "mode_force": 9 * c if n["block_count"] else 0,
+        "selected": 9 * (n["slot_count"] + c + 1),
     }  # fmt: skip
 
 
@@ -97,6 +99,8 @@ def _bodies(scalar: str, lanes: int, *, shared: bool) -> SimpleNamespace:
 
     def solve(plan: _ids, numbers: real, k: real, s: real, f: real): ...
 
+    def selected(plan: _ids, numbers: real, k: real, s: real, f: real): ...
+
     def terms(
         plan: _ids, numbers: real, k: real, s: real, f: real, softs: _ids, stiffs: real, reference: real,
         soft_count: int, hinge_end: int, stiffness: number, trial: int,
@@ -127,7 +131,7 @@ def _bodies(scalar: str, lanes: int, *, shared: bool) -> SimpleNamespace:
         "assemble": (text.ASSEMBLE, assemble), "twists": (text.TWISTS, twists), "forces": (text.FORCES, forces),
         "modes": (text.MODES, modes), "factor": (text.FACTOR, factor), "solve": (text.SOLVE, solve),
         "terms": (text.TERMS, terms), "move": (text.MOVE, move), "accept": (text.ACCEPT, accept),
-        "still": (still, root_turn),
+        "still": (still, root_turn), "selected": (variance.SELECTED, selected),
     }  # fmt: skip
     return SimpleNamespace(**{name: made(*given) for name, given in bodies.items()})
 
@@ -209,7 +213,7 @@ def _step_kernels(scalar: str, lanes: int, *, shared: bool) -> SimpleNamespace:
     body, width = _bodies(scalar, lanes, shared=shared), lanes
     load, store = transposing(scalar, lanes)
     walk, assemble, twists, forces, modes = body.walk, body.assemble, body.twists, body.forces, body.modes
-    factor, solve, terms, still = body.factor, body.solve, body.terms, body.still
+    factor, solve, terms, still, selected = body.factor, body.solve, body.terms, body.still, body.selected
     module = wp.get_module(f"soma_pose_steps_{scalar}_{lanes}_{'one' if shared else 'each'}")
 
     @wp.func
@@ -284,7 +288,17 @@ def _step_kernels(scalar: str, lanes: int, *, shared: bool) -> SimpleNamespace:
             solve(plan, numbers, k, s, m)
             store(s, at[16], at[17], out, wp.int64(at[17]), 0, f, last)
 
-    return SimpleNamespace(walked=walked, slopes=slopes, factorise=factorise, solved=solved)
+    @wp.kernel(module=module, enable_backward=False)
+    def varied(
+        task: _Task, plan: _ids, numbers: real, constants: rows, memory: rows, kept: rows, at: _ids, out: real
+    ):
+        w, count = wp.tid(), at[17] // 3 - 1
+        for g in range(task.begin + w, task.end, memory.shape[0]):
+            s, m, k = memory[w], kept[g], constants[0]
+            selected(plan, numbers, k, s, m)
+            store(s, at[16], count, out, wp.int64(count), 0, g * width, task.frames - 1)
+
+    return SimpleNamespace(walked=walked, slopes=slopes, factorise=factorise, solved=solved, varied=varied)
 
 
 class Soft(NamedTuple):
@@ -433,6 +447,13 @@ class PoseSolver:
         none = slope.new_zeros(1, 1)
         self._launch(kernel, none, slope, (as_warp(given), as_warp(out)), kept=factor.kept)
         return _ascending(out)
+
+    def variances(self, factor: Factor) -> Tensor:
+        """Traces (F, n) of the variables' own blocks of the matrix's inverse, ascending."""
+        out = factor.kept.new_empty(factor.count, self.columns - self.driven)
+        kernel = _step_kernels(scalar_name(out.dtype), lane_count(out), shared=True).varied
+        self._launch(kernel, out.new_zeros(1, 1), out, (as_warp(out),), kept=factor.kept)
+        return out.flip(1)
 
     def _soft(self, soft: Soft):
         columns = soft.columns if len(soft.columns) else soft.columns.new_zeros(1)
