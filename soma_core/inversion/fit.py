@@ -182,11 +182,16 @@ class PoseInversion(torch.nn.Module):
                 expected="none with robust or temporal terms, whose fit has no derivative here",
                 fix="Pass vertices.detach(), or leave out robust and temporal_strength.",
             )
+
+        def problem(chunk: slice) -> Problem:
+            part = frames.part(chunk)
+            known, _ = _without_gaps(part.vertices, part.weights, self.layer)
+            rest = part.rest.get(self.model)
+            return self.model.problem(known, part.identity, part.weights, part.bone_scale, self.terms, rest)
+
         rotations, translation = attach_gradient(
-            vertices, result.rotations, result.translation, solver=self.model.solver, moments=self.model.moments,
-            identity=frames.identity, weights=frames.weights, valid=result.valid, terms=self.terms,
-            offsets=self.layer.animation.bone_vectors(frames.identity, frames.bone_scale),
-        )  # fmt: skip
+            vertices, result.rotations, result.translation, model=self.model, problem=problem, valid=result.valid
+        )
         return replace(result, rotations=rotations, translation=translation)
 
     def _frames(

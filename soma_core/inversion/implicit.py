@@ -2,26 +2,32 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+import warnings
+from collections.abc import Callable
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
-from soma_core.geometry.rotations import skew
-from soma_core.inversion.problem import part_of
-from soma_core.inversion.gauss_newton import GaussNewton
-from soma_core.inversion.moments import RestMoments, SkinMoments
 from soma_core.inversion.priors import JointTerms
-from soma_core.inversion.problem import Pose
-from soma_core.skeleton.identity import Identity
+from soma_core.inversion.problem import Pose, Problem
+from soma_core.inversion.protocol import Curvature, ForwardModel
 
-__all__ = ["attach_gradient"]
+__all__ = ["attach_gradient", "slope_of_cotangents"]
 
 _CHUNK = 64
-"""Frames whose matrices are held at a time."""
+"""Frames treated at a time."""
 
-_RIDGE = {torch.float32: 1e-6, torch.float64: 1e-12}
-"""Relative to the diagonal: gradients of what the target does not determine stay finite."""
+_ROUNDS = 200
+"""Largest number of products with the curvature."""
+
+_ACCURATE = {torch.float32: 1e-6, torch.float64: 1e-10}
+"""A frame is done when the slope that is left is this share of the first."""
+
+_RIDGE = 1e-13
+_DAMPING = 1e-6
+"""What a turn by one radian costs as the square of an error of every vertex [m], so that gradients of what the target does not
+determine stay finite; and what the moments' matrix is damped by, relative to its diagonal."""
 
 
 def attach_gradient(
@@ -29,31 +35,28 @@ def attach_gradient(
     rotations: Tensor,
     translation: Tensor,
     *,
-    solver: GaussNewton,
-    moments: SkinMoments,
-    identity: Identity,
-    weights: Tensor,
-    offsets: Tensor,
+    model: ForwardModel,
+    problem: Callable[[slice], Problem],
     valid: Tensor,
-    terms: JointTerms | None,
 ) -> tuple[Tensor, Tensor]:
     """Rotations and translation of a fit as differentiable functions of its target.
 
-    At a minimum ``J^T O (y - x) = 0``, hence ``d pose = (J^T O J)^-1 J^T O dx``: exact where the residual is
-    zero, the Gauss-Newton approximation elsewhere. Frames that are not valid get no gradient.
+    At a minimum the slope ``g(pose, x) = J^T O (y - x)``, terms included, is zero, hence
+    ``d pose = H^-1 J^T O dx`` with the exact second derivative H of half the error: J^T O J, the curvature that the
+    residual adds, and the terms. The system is solved by conjugate gradients with the moments' matrix as
+    preconditioner.
+
+    Frames that are not valid get no gradient. Nor do frames whose error curves downwards somewhere, which are not at
+    a minimum and have no derivative: a ``RuntimeWarning`` in the backward pass names them.
 
     Args:
         vertices: targets (F, v, 3) [m] that the fit was made for.
         rotations: (F, J - 1, 3, 3), T-pose-relative, and translation (F, 3) [m]: the fit.
-        solver, moments: as in the fit.
-        identity: batch of 1 or F; no gradient reaches it.
-        weights: (1 or F, v).
-        offsets: bone vectors (1 or F, J, 3) [m].
+        model: that was fitted.
+        problem: of a chunk of the frames; no gradient reaches its identity and weights.
         valid: (F,) bool.
-        terms: soft terms of the fit.
     """
-    parts = solver, moments, identity, weights, offsets, valid, terms
-    return _Implicit.apply(vertices, rotations, translation, parts)
+    return _Implicit.apply(vertices, rotations, translation, (model, problem, valid))
 
 
 class _Implicit(torch.autograd.Function):
@@ -65,49 +68,53 @@ class _Implicit(torch.autograd.Function):
 
     @staticmethod
     @torch.autograd.function.once_differentiable
-    def backward(ctx, rotations_grad, translation_grad):
-        solver, moments, identity, weights, offsets, valid, terms = ctx.parts
-        frames = *ctx.saved_tensors, rotations_grad, translation_grad, valid
-        shared = (
-            moments.rest(identity, weights, offsets) if identity.batch_size == len(weights) == 1 else None
-        )
-        grads = []
+    def backward(ctx, by_rotations, by_translation):
+        model, problem, valid = ctx.parts
+        frames = *ctx.saved_tensors, by_rotations, by_translation, valid
+        grads, good = [], []
         for first in range(0, len(valid), _CHUNK):
             chunk = slice(first, first + _CHUNK)
-            weight, bones = (one[chunk] if len(one) > 1 else one for one in (weights, offsets))
-            rest = shared or moments.rest(part_of(identity, chunk), weight, bones)
-            if shared:
-                rest = replace(rest, offsets=bones)
-            moved = _pull_back(*(one[chunk] for one in frames), solver, moments, rest, terms)
-            grads.append(moved * weight[..., None])
-        return torch.cat(grads), None, None, None
+            moved, fine = _pull_back(model, problem(chunk), *(one[chunk] for one in frames))
+            grads.append(moved)
+            good.append(fine)
+        _warn(torch.cat(good) if good else valid)
+        return torch.cat(grads) if grads else None, None, None, None
 
 
 def _pull_back(
+    model: ForwardModel,
+    problem: Problem,
     rotations: Tensor,
     translation: Tensor,
-    rotations_grad: Tensor,
-    translation_grad: Tensor,
+    by_rotations: Tensor,
+    by_translation: Tensor,
     valid: Tensor,
-    solver: GaussNewton,
-    moments: SkinMoments,
-    rest: RestMoments,
-    terms: JointTerms | None,
+) -> tuple[Tensor, Tensor]:
+    """Gradient (F, v, 3) by the target of a chunk of frames, and whether each frame has one."""
+    eye = model.solver.eye.expand(len(rotations), 1, 3, 3)
+    pose = Pose.begin(torch.cat((eye, rotations), 1), translation - problem.origin)
+    turns, _ = model.solver.walk(pose, problem.rest)
+    slope = slope_of_cotangents(model, rotations, turns, by_rotations, by_translation)
+    system = _System(model, problem, pose, turns, model.curvature(problem, pose))
+    motion, good = system.solve(torch.where(valid[:, None, None], slope, 0.0))
+    moved = system.curvature.moved(motion) * problem.weights[..., None]
+    return torch.where(valid[:, None, None], moved, 0.0), good | ~valid
+
+
+def slope_of_cotangents(
+    model: ForwardModel, rotations: Tensor, turns: Tensor, by_rotations: Tensor, by_translation: Tensor
 ) -> Tensor:
-    """Gradient (F, v, 3) by the target of a chunk of frames, vertex weights left out."""
-    eye = solver.eye.expand(len(rotations), 1, 3, 3)
-    relative = torch.cat((eye, rotations), 1)
-    # The matrix does not depend on where the body stands; near the origin it is most precise.
-    turns, places = solver.walk(Pose.begin(relative, torch.zeros_like(translation)), rest)
-    n = solver.variables
-    above = turns[:, solver.parents[n]]
-    zero = torch.zeros(len(rotations), len(moments.joints), 3, 4).to(rotations)
-    matrix, _ = solver.normal_equations(turns, places, rest.second, zero)
-    if terms is not None:
-        mass = rest.own[..., 3, 3].sum(1)
-        solver.add_terms(matrix, torch.zeros_like(above[..., 0]), relative, turns, terms, mass)
-    product = relative[:, n] @ rotations_grad[:, n - 1].transpose(-1, -2)
-    local = torch.stack(
+    """Derivative (F, n + 1, 3) by turns in world axes, and by the translation, from that by matrix entries.
+
+    Args:
+        model: whose variables count.
+        rotations: (F, J - 1, 3, 3) T-pose-relative.
+        turns: world turns, the virtual root's included, (F, J or more, 3, 3).
+        by_rotations, by_translation: derivatives (F, J - 1, 3, 3) and (F, 3).
+    """
+    n = model.solver.variables
+    product = rotations[:, n - 1] @ by_rotations[:, n - 1].mT
+    torque = torch.stack(
         (
             product[..., 1, 2] - product[..., 2, 1],
             product[..., 2, 0] - product[..., 0, 2],
@@ -115,37 +122,91 @@ def _pull_back(
         ),
         -1,
     )
-    slope = torch.cat(((above @ local[..., None]).squeeze(-1), translation_grad[:, None]), 1)
-    motion = _solve(matrix, torch.where(valid[:, None, None], slope, 0.0))
-    return _velocities(solver, moments, rest, turns, places, motion)
+    torque = (turns[:, model.solver.parents[n]] @ torque[..., None]).squeeze(-1)
+    return torch.cat((torque, by_translation[:, None]), 1)
 
 
-def _solve(matrix: Tensor, slope: Tensor) -> Tensor:
-    dense = matrix.flatten(3, 4).flatten(1, 2)
-    diagonal = dense.diagonal(dim1=-2, dim2=-1)
-    ridge = _RIDGE[dense.dtype] * diagonal.clamp_min(1e-12)
-    factor, _ = torch.linalg.cholesky_ex(dense + torch.diag_embed(ridge))
-    return torch.cholesky_solve(slope.flatten(1)[..., None], factor).view_as(slope)
+@dataclass(frozen=True, kw_only=False, eq=False)
+class _System:
+    """The second derivative of half the error, terms included, at poses; hinges turn about their axis alone."""
+
+    model: ForwardModel
+    problem: Problem
+    pose: Pose
+    turns: Tensor
+    curvature: Curvature
+
+    def solve(self, slope: Tensor) -> tuple[Tensor, Tensor]:
+        """Motions (F, n + 1, 3) that the matrix maps to slopes, and (F,) whether it is positive on the way."""
+        problem, kind = self.problem, slope.dtype
+        mass = problem.weights.sum(1).expand(len(slope))
+        view = self.model.view(problem, self.pose)
+        damping = torch.full_like(mass, _DAMPING)
+        inverse = self.model.inverse(problem, self.pose, view, damping, mass)
+        blocks = None if problem.terms is None else _term_blocks(self, problem.terms, mass)
+        ridge = (_RIDGE * mass)[:, None, None]
+        left = self._free(slope)
+        motion, good = torch.zeros_like(left), torch.ones_like(mass, dtype=torch.bool)
+        near = self._free(inverse(left))
+        way, size = near, _inner(left, near)
+        enough = _ACCURATE[kind] ** 2 * _inner(left, left)
+        moving = size > 0
+        for _ in range(_ROUNDS):
+            if not bool(moving.any()):
+                break
+            bent = self.curvature.times(way) + ridge * way
+            if blocks is not None:
+                bent[:, :-1] += (blocks @ way[:, :-1, :, None]).squeeze(-1)
+            bent = self._free(bent)
+            curved = _inner(way, bent)
+            good = good & ~(moving & ~(curved > 0))
+            moving = moving & good
+            step = torch.where(moving, size / torch.where(moving, curved, 1.0), 0.0)[:, None, None]
+            motion, left = motion + step * way, left - step * bent
+            near = self._free(inverse(left))
+            new = _inner(left, near)
+            moving = moving & (_inner(left, left) > enough)
+            way = near + torch.where(moving, new / torch.where(moving, size, 1.0), 0.0)[:, None, None] * way
+            size = new
+        return torch.where(good[:, None, None], motion, 0.0), good
+
+    def _free(self, motion: Tensor) -> Tensor:
+        """The part of a motion that hinges allow."""
+        terms = self.problem.terms
+        return motion if terms is None else self.model.solver._along_hinges(motion, self.turns, terms)
 
 
-def _velocities(
-    solver: GaussNewton,
-    moments: SkinMoments,
-    rest: RestMoments,
-    turns: Tensor,
-    places: Tensor,
-    motion: Tensor,
-) -> Tensor:
-    """Velocities (F, v, 3) of the vertices when the joints turn and the body shifts by `motion`."""
-    joints, n = moments.joints, solver.variables
-    own = torch.zeros_like(places).index_copy(1, n, motion[:, :-1])
-    spin = solver.down_the_tree(own)
-    lever = solver.down_the_tree(torch.linalg.cross(places, own, dim=-1)) + motion[:, -1:]
-    shift = torch.linalg.cross(spin, places, dim=-1) + lever
-    turned = skew(spin[:, joints]) @ turns[:, joints]
-    of = moments.influence_joint
-    points = rest.local.expand(len(motion), -1, 3)
-    step = (turned[:, of] @ points[..., None]).squeeze(-1) + shift[:, joints][:, of]
-    step = step * moments.influence_weight.to(step)[:, None]
-    out = step.new_zeros(len(step), moments.vertex_count, 3)
-    return out.index_add_(1, moments.influence_vertex, step)
+def _inner(one: Tensor, other: Tensor) -> Tensor:
+    return (one * other).sum((1, 2))
+
+
+def _term_blocks(system: _System, terms: JointTerms, mass: Tensor) -> Tensor:
+    """Half the second derivative of the terms, (F, n, 3, 3) by world turns.
+
+    Along the arc back a term is quadratic; across it, it curves with ``(angle - free) / (2 tan(angle / 2))``.
+    """
+    n = system.model.solver.variables
+    relative = system.pose.relative[:, n]
+    axis, over, angle = terms._deviation(relative)
+    above = system.turns[:, system.model.solver.parents[n]]
+    world = (above[:, terms.variable] @ axis[..., None]).squeeze(-1)
+    small = angle < 1e-4
+    round_arc = torch.where(small, 1.0, 0.5 * over / torch.tan(0.5 * torch.where(small, 1.0, angle)))
+    across = terms.stiffness * torch.where(small & (terms.free > 0), 0.0, round_arc)
+    along = torch.where((over > 0) | (terms.free == 0), terms.stiffness.expand_as(across), 0.0)
+    eye = system.model.solver.eye
+    outer = world[..., :, None] * world[..., None, :]
+    block = across[..., None, None] * eye + (along - across)[..., None, None] * outer
+    return mass[:, None, None, None] * torch.zeros_like(relative).index_add(1, terms.variable, block)
+
+
+def _warn(good: Tensor) -> None:
+    if bool(good.all()):
+        return
+    bad = torch.nonzero(~good).flatten().tolist()
+    warnings.warn(
+        f"{len(bad)} of {len(good)} frames got no gradient through the fit, the first is {bad[0]}: their error "
+        "curves downwards where they rest, which is no minimum. Fit with more steps (refreshes), or leave them out.",
+        RuntimeWarning,
+        stacklevel=2,
+    )

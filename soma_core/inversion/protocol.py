@@ -1,0 +1,55 @@
+"""What a fit asks of a forward model, whatever moves its vertices."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Protocol
+
+from torch import Tensor
+
+from soma_core.inversion.gauss_newton import GaussNewton
+from soma_core.inversion.problem import Pose, Problem, View
+
+__all__ = ["Curvature", "ForwardModel"]
+
+
+class Curvature(Protocol):
+    """How the error of some poses curves, about where they are.
+
+    Motions (F, n + 1, 3) are turns of the variable joints in world axes, the translation last, as steps of
+    :meth:`GaussNewton.retract` are.
+    """
+
+    def times(self, motion: Tensor) -> Tensor:
+        """Half the second derivative of the error, times a motion; terms are left out."""
+
+    def moved(self, motion: Tensor) -> Tensor:
+        """Velocities (F, v, 3) of the vertices in a motion."""
+
+
+class ForwardModel(Protocol):
+    """Skinning by the joints of one rig, and whatever else follows from a pose.
+
+    Attributes:
+        solver: of its poses.
+    """
+
+    @property
+    def solver(self) -> GaussNewton: ...
+
+    def view(self, problem: Problem, pose: Pose, bound: Tensor | None = None) -> View:
+        """Error of poses, and its exact derivative; residuals beyond `bound` (F,) [m] count linearly."""
+
+    def inverse(
+        self, problem: Problem, pose: Pose, view: View, damping: Tensor, mass: Tensor
+    ) -> Callable[[Tensor], Tensor]:
+        """Maps slopes (F, n + 1, 3) to steps: about the inverse of the damped curvature, terms included.
+
+        Args:
+            problem, pose, view: where.
+            damping: (F,) relative to the diagonal.
+            mass: (F,) sums of the vertex weights.
+        """
+
+    def curvature(self, problem: Problem, pose: Pose) -> Curvature:
+        """The exact curvature at poses."""
