@@ -191,5 +191,6 @@ def half_angle(rotation: Tensor, axis: Tensor) -> tuple[Tensor, Tensor]:
     along = (vector * axis).sum(-1, keepdim=True)
     more = 1 + real
     slope = more * (real * axis + torch.linalg.cross(vector, axis.expand_as(vector), dim=-1)) + along * vector
-    angle = 4 * torch.atan2(along, more).squeeze(-1)
+    # Not atan2: PyTorch 2.13 rounds it by where an entry lies in a tensor, and frames would touch one another.
+    angle = 4 * torch.atan(along / more).squeeze(-1)
     return angle, 2 * slope / (more * more + along * along)

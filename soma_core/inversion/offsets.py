@@ -123,7 +123,7 @@ class PoseOffsets(torch.nn.Module):
         features = turned.flatten(1)
         if self.first is None:
             return Activity(value=features)
-        before = self.first(features.T.contiguous()).T
+        before = self.first(_paired(features).T.contiguous()).T[: len(features)]
         value = self.squashed(before)
         rising = (before > 0).to(before)
         slope = rising * (1 - value * value) if self.squash else rising
@@ -170,7 +170,7 @@ class PoseOffsets(torch.nn.Module):
             above: (F, J, 3, 3) world turns of the parents.
         """
         if self.first is not None:
-            pull = self.first.pull_back(pull * activity.slope)
+            pull = self.first.pull_back(_paired(pull * activity.slope))[: len(pull)]
         by_feature = pull.unflatten(1, (-1, 3, self.columns))
         by_rotation = self.left.mT @ by_feature @ self.right[..., : self.columns].mT
         product = relative @ by_rotation.mT
@@ -245,6 +245,11 @@ class PoseOffsets(torch.nn.Module):
         torque = torque - skew(places[:, all_variables]) @ force_below
         rows = torch.cat((torque, force.sum(1, keepdim=True)), 1)
         return rows if fold is None else solver.folded(rows, fold)
+
+
+def _paired(rows: Tensor) -> Tensor:
+    """Rows of frames, of a lone one twice: sums over one column alone run in another order (PyTorch 2.13)."""
+    return rows.expand(2, -1) if len(rows) == 1 else rows
 
 
 def _matrix(rows: SparseRows) -> scipy.sparse.csr_array:
