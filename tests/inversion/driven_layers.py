@@ -35,7 +35,7 @@ _NEARLY_HALF = 179.9
 """Degrees."""
 _NUDGE = 0.02
 """Turns of all joints [rad] where twists are read off local rotations: some of the shipped rig's lie at half
-a turn in the T-pose itself, where such an angle jumps. And with correctives: the T-pose lies on their kink."""
+a turn in the T-pose itself, where such an angle jumps. With correctives: the T-pose lies on their kink."""
 
 
 @functools.cache

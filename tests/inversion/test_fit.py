@@ -283,7 +283,7 @@ def test_callers_with_and_without_gradients_get_the_same(inversion, targets, ide
     tracked = inversion(targets.clone().requires_grad_(), identity)
     for field in fields(tracked):
         value = getattr(tracked, field.name).detach()
-        torch.testing.assert_close(value, getattr(result, field.name), atol=1e-6, rtol=0)
+        torch.testing.assert_close(value, getattr(result, field.name), atol=1e-6, rtol=0, equal_nan=True)
     assert not result.rotations.requires_grad
 
 

@@ -1,4 +1,4 @@
-"""What a pose adds to the rest shape: as the layer adds it, its derivative exact, its matrix near the true one."""
+"""What a pose adds to the rest shape: as the layer adds it, its slope exact, its matrix near the true one."""
 
 import functools
 
