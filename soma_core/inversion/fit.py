@@ -19,7 +19,7 @@ from soma_core.inversion.implicit import attach_gradient
 from soma_core.inversion.ladder import Ladder, LadderOptions, Stage, Targets
 from soma_core.inversion.model import PoseModel
 from soma_core.inversion.moments import RestMoments
-from soma_core.inversion.priors import PosePriors, joint_terms, neighbour_mean, with_references
+from soma_core.inversion.priors import PosePriors, joint_terms, neighbour_mean, twist_doubt, with_references
 from soma_core.inversion.problem import Pose, Problem, part_of
 from soma_core.inversion.result import InversionResult, joined
 from soma_core.inversion.start import cloud_extent
@@ -117,7 +117,9 @@ class PoseInversion(torch.nn.Module):
         self.ladder = Ladder(layer, options, warp=warp)
         kind = {"dtype": layer.dtype, "device": layer.device}
         names = layer.rig.joint_names
-        self.terms = joint_terms(self.priors, [names[j] for j in self.model.solver.variables.tolist()], **kind)
+        variables = [names[j] for j in self.model.solver.variables.tolist()]
+        self.terms = joint_terms(self.priors, variables, **kind)
+        self.doubt = twist_doubt(self.priors, variables, **kind) if self.model.driven is not None else None
         fitted = torch.as_tensor(self.model.fitted, device=layer.device)
         self.register_buffer("default_weights", fitted.to(layer.dtype), persistent=False)
 
@@ -266,7 +268,7 @@ class PoseInversion(torch.nn.Module):
             terms = with_references(terms, frames.reference, strength)
         targets = Targets(
             vertices=vertices, identity=frames.identity, weights=frames.weights, terms=terms,
-            bone_scale=frames.bone_scale, rest=frames.rest,
+            bone_scale=frames.bone_scale, doubt=self.doubt, rest=frames.rest,
         )  # fmt: skip
         eye = torch.eye(3, dtype=vertices.dtype, device=vertices.device)
         start = None

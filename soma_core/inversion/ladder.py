@@ -14,7 +14,7 @@ from soma_core.inversion.analytical import Analytical, AnalyticalOptions
 from soma_core.inversion.autograd import Autograd, AutogradOptions
 from soma_core.inversion.model import PoseModel
 from soma_core.inversion.moments import RestMoments
-from soma_core.inversion.priors import JointTerms, hinge_rotation
+from soma_core.inversion.priors import JointTerms, TwistDoubt, hinge_rotation
 from soma_core.inversion.problem import Pose, Problem
 from soma_core.inversion.regions import body_regions
 from soma_core.inversion.start import best_translation
@@ -94,6 +94,7 @@ class Targets:
         weights: (1 or F, v).
         bone_scale: (1 or F, J - 1); None without.
         terms: soft terms and hinges; None without.
+        doubt: of the joints' twists, under the full model; None without.
         rest: moments of the one identity by model, where there is one.
     """
 
@@ -102,13 +103,15 @@ class Targets:
     weights: Tensor
     bone_scale: Tensor | None
     terms: JointTerms | None
+    doubt: TwistDoubt | None
     rest: dict[PoseModel, RestMoments]
 
     def problem(self, model: PoseModel) -> Problem:
         """The problem for one model."""
-        return model.problem(
+        problem = model.problem(
             self.vertices, self.identity, self.weights, self.bone_scale, self.terms, self.rest.get(model)
         )
+        return replace(problem, doubt=self.doubt)
 
 
 class Ladder(torch.nn.Module):

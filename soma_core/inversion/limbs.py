@@ -22,7 +22,8 @@ from soma_core.geometry.rotations import axis_angle_to_matrix, matrix_to_quatern
 from soma_core.inversion.driven import DrivenJoints, half_angle
 from soma_core.inversion.moments import RestMoments
 from soma_core.inversion.offsets import PoseOffsets
-from soma_core.inversion.problem import Pose, View
+from soma_core.inversion.priors import TwistDoubt
+from soma_core.inversion.problem import Pose, Problem, View
 from soma_core.rig.skeleton import Rig
 
 __all__ = ["LimbStart", "TwistShare"]
@@ -192,20 +193,32 @@ class TwistShare:
             )  # fmt: skip
 
     def __call__(
-        self, pose: Pose, view: View, rest: RestMoments, scale: Tensor, held: Collection[int] = ()
+        self,
+        pose: Pose,
+        view: View,
+        problem: Problem,
+        scale: Tensor,
+        variables: Tensor,
+        held: Collection[int] = (),
     ) -> Pose:
         """The pose with the best share of every limb, as far as moments tell.
 
         Args:
             pose, view: where to look from.
-            rest: of the identities.
+            problem: whose moments and doubt of twists count.
             scale: (F,) size of the bodies.
+            variables: (n,) joints that may turn.
             held: joints that cannot turn so; limbs with such stay as they are.
         """
+        rest, doubt = problem.rest, problem.doubt
+        still = None if doubt is None else doubt.share(pose.relative[:, variables])
         relative = pose.relative.clone()
         angle = torch.linspace(-math.pi, math.pi, _SHARES).to(relative)
         for limb in self.free(held):
             energy = self._skin(limb, angle, view, rest) + self._moves(limb, angle, pose.relative, view, scale)
+            if doubt is not None and still is not None:
+                change = self._doubts(limb, angle, pose.relative, doubt, variables)
+                energy = (view.energy[:, None] + energy).clamp_min(0) * (1 + still[:, None] + change)
             self.turn(relative, limb, angle[energy.argmin(1)])
         return replace(pose, relative=relative)
 
@@ -242,6 +255,19 @@ class TwistShare:
         energy = energy + (both * part[:, :, limb.second]).sum((-2, -1))
         jumping = (clear[:, :-1] < _CLEAR).any(-1)
         return energy + jumping * (_DEAR**2 * rest.own[..., 3, 3].sum(1))[:, None]
+
+    def _doubts(
+        self, limb: _Limb, angle: Tensor, relative: Tensor, doubt: TwistDoubt, variables: Tensor
+    ) -> Tensor:
+        """Change (F, a) of the doubt of the next joint's twist."""
+        which = torch.nonzero(variables[doubt.variable] == limb.end).flatten()
+        if not len(which):
+            return relative.new_zeros(len(relative), len(angle))
+        turn = axis_angle_to_matrix(-torch.cat((angle, angle[:1] * 0))[:, None] * limb.axis)
+        turned = (turn @ relative[:, limb.end, None]).flatten(0, 1)[:, None]  # (F (a + 1), 1, 3, 3)
+        one = replace(doubt, variable=which[:1] * 0, axis=doubt.axis[which[:1]], square=doubt.square[which[:1]])
+        share = one.share(turned).view(len(relative), -1)
+        return share[:, :-1] - share[:, -1:]
 
     def _twists(
         self, limb: _Limb, angle: Tensor, view: View, rest: RestMoments

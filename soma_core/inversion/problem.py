@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from soma_core.inversion.moments import RestMoments
-from soma_core.inversion.priors import JointTerms
+from soma_core.inversion.priors import JointTerms, TwistDoubt
 from soma_core.skeleton.identity import Identity
 
 __all__ = ["Activity", "Pose", "Problem", "View", "part_of"]
@@ -27,6 +27,7 @@ class Problem:
         origin: (F, 3) [m]; poses under way are relative to it.
         bone_scale: factors (1 or F, J - 1) of the bone vectors, already in ``rest.offsets``; None without.
         terms: soft terms and hinges; None without.
+        doubt: of the joints' twists; None without.
     """
 
     vertices: Tensor
@@ -37,6 +38,7 @@ class Problem:
     origin: Tensor
     bone_scale: Tensor | None = None
     terms: JointTerms | None = None
+    doubt: TwistDoubt | None = None
 
     def part(self, rows: Tensor) -> Problem:
         """The problem of some of its frames."""

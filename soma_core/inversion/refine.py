@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from soma_core.inversion.model import PoseModel
+from soma_core.inversion.priors import JointTerms, TwistDoubt
 from soma_core.inversion.problem import Pose, Problem, View
 
 __all__ = ["Refinement"]
@@ -102,7 +103,7 @@ class Refinement:
         solve = None
         for count in range(iterations + 1):
             if solve is None or count in _FACTORISED:
-                solve = self.model.inverse(self.problem, pose, view, damping, self.mass)
+                solve = self._inverse(pose, view, damping)
             step = -memory.direction(view.slope.flatten(1), lambda one, to=solve: to(one.view(shape)).flatten(1))
             step = solver.shortened(step.view(shape), view.turns, self.problem.terms)
             decrement = (-(step * view.slope).sum((1, 2)).clamp_max(0) / self.mass).sqrt()
@@ -131,16 +132,37 @@ class Refinement:
 
     def _view(self, pose: Pose) -> View:
         view = self.model.view(self.problem, pose, self.bound)
-        terms = self.problem.terms
-        if terms is None:
-            return view
-        slope = view.slope.clone()
+        terms, doubt = self.problem.terms, self.problem.doubt
+        if terms is not None:
+            view = self._with_terms(view, pose, terms, self.mass)
+        if doubt is not None:
+            view = self._doubted(view, pose, doubt)
+        return view
+
+    def _doubted(self, view: View, pose: Pose, doubt: TwistDoubt) -> View:
+        """The error E as ``E (1 + S)``, and its slope over ``1 + S``: the same direction, as long as that of E."""
         n = self.model.solver.variables
+        rotations, more = pose.relative[:, n], 1 + doubt.share(pose.relative[:, n])
+        slope = view.slope.clone()
+        own = doubt.slope(rotations, view.turns[:, self.model.solver.parents[n]])
+        slope[:, : len(n)] += (view.energy / more)[:, None, None] * own
+        return replace(view, slope=slope, energy=view.energy * more)
+
+    def _with_terms(self, view: View, pose: Pose, terms: JointTerms, mass: Tensor) -> View:
+        slope, n = view.slope.clone(), self.model.solver.variables
         above = view.turns[:, self.model.solver.parents[n]]
         _, more = terms.normal_equations(pose.relative[:, n], above)
-        slope[:, : len(n)] += self.mass[:, None, None] * more
-        energy = view.energy + self.mass * terms.energy(pose.relative[:, n])
+        slope[:, : len(n)] += mass[:, None, None] * more
+        energy = view.energy + mass * terms.energy(pose.relative[:, n])
         return replace(view, slope=slope, energy=energy)
+
+    def _inverse(self, pose: Pose, view: View, damping: Tensor) -> Callable[[Tensor], Tensor]:
+        doubt, problem, mass = self.problem.doubt, self.problem, self.mass
+        if doubt is not None and problem.terms is None:
+            rotations = pose.relative[:, self.model.solver.variables]
+            problem = replace(problem, terms=doubt.blocks(rotations))
+            mass = view.energy / (1 + doubt.share(rotations)).square()
+        return self.model.inverse(problem, pose, view, damping, mass)
 
 
 def _chosen(better: Tensor, new: Tensor, old: Tensor) -> Tensor:

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from soma_core.inversion.model import PoseModel
+from soma_core.inversion.priors import JointTerms
 from soma_core.inversion.problem import Pose, Problem
 from soma_core.inversion.refine import Refinement
 
@@ -19,6 +20,10 @@ __all__ = ["WholeFit"]
 
 _ROUNDS, _STEPS = 2, 5
 """How often offsets and the limbs' twist are looked at before the descent, and steps on moments after each."""
+
+_KEPT = 8e-3
+"""Strength that keeps the joint below an upper arm or a thigh while moments are fitted [m/rad]: far above what tells
+its twist, far below what tells how it bends."""
 
 _RESTING, _RESTING_SHARE = 1.5e-7, 3e-4
 """A frame rests where a Newton step would change it by less, as a root mean square of its vertices [m], or
@@ -49,6 +54,11 @@ class WholeFit:
 
     def __init__(self, coarse: PoseModel, model: PoseModel, options: LadderOptions) -> None:
         self.coarse, self.model, self.options = coarse, model, options
+        self.ends = None
+        if coarse.share is not None and coarse.share.limbs:
+            variables = coarse.solver.variables.tolist()
+            ends = [variables.index(limb.end) for limb in coarse.share.limbs if limb.end in variables]
+            self.ends = torch.tensor(ends, device=coarse.solver.variables.device)
 
     def __call__(self, targets: Targets, pose: Pose) -> tuple[Pose, Problem]:
         """The pose, its translation in the world, and the problem of the model.
@@ -85,7 +95,7 @@ class WholeFit:
             view = model.view(problem, pose, bound)
             pose = model.solver(
                 problem.target, problem.rest, pose, iterations=_STEPS, tolerance=self.options.tolerance,
-                terms=problem.terms, residual=view.residual,
+                terms=self._kept(problem, pose), residual=view.residual,
             )  # fmt: skip
         return replace(pose, accepted=torch.zeros_like(pose.accepted)), bound
 
@@ -95,7 +105,31 @@ class WholeFit:
             return pose
         view = self.coarse.view(problem, pose, bound)
         scale = self.coarse.scale(problem).expand(len(pose.translation))
-        return share(pose, view, problem.rest, scale, self._held(problem))
+        return share(pose, view, problem, scale, self.coarse.solver.variables, self._held(problem))
+
+    def _kept(self, problem: Problem, pose: Pose) -> JointTerms | None:
+        """Terms that keep the share of a limb's twist, which moments do not tell."""
+        if self.ends is None:
+            return problem.terms
+        rotations = pose.relative[:, self.coarse.solver.variables]
+        count = len(problem.vertices)
+        terms = JointTerms(
+            variable=self.ends,
+            stiffness=rotations.new_full((len(self.ends),), _KEPT**2),
+            free=rotations.new_zeros(len(self.ends)),
+            reference=rotations[:, self.ends],
+            hinge_axis=rotations.new_zeros(rotations.shape[1], 3),
+        )
+        given = problem.terms
+        if given is None:
+            return terms
+        return replace(
+            given,
+            variable=torch.cat((given.variable, terms.variable)),
+            stiffness=torch.cat((given.stiffness, terms.stiffness)),
+            free=torch.cat((given.free, terms.free)),
+            reference=torch.cat((given.reference.expand(count, -1, 3, 3), terms.reference), 1),
+        )
 
     def _held(self, problem: Problem) -> frozenset[int]:
         """Joints that are hinges."""
