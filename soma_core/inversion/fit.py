@@ -189,11 +189,13 @@ class PoseInversion(torch.nn.Module):
             part = frames.part(chunk)
             known, _ = _without_gaps(part.vertices, part.weights, self.layer)
             rest = part.rest.get(self.model)
-            return self.model.problem(known, part.identity, part.weights, part.bone_scale, self.terms, rest)
+            made = self.model.problem(known, part.identity, part.weights, part.bone_scale, self.terms, rest)
+            return replace(made, doubt=self.doubt)
 
         rotations, translation = attach_gradient(
-            vertices, result.rotations, result.translation, model=self.model, problem=problem, valid=result.valid
-        )
+            vertices, result.rotations, result.translation, model=self.model, problem=problem,
+            valid=result.valid,
+        )  # fmt: skip
         return replace(result, rotations=rotations, translation=translation)
 
     def _frames(

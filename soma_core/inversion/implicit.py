@@ -4,30 +4,32 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
-from soma_core.inversion.priors import JointTerms
+from soma_core.inversion.prior_curvature import Priors
 from soma_core.inversion.problem import Pose, Problem
 from soma_core.inversion.protocol import Curvature, ForwardModel
 
-__all__ = ["attach_gradient", "slope_of_cotangents"]
+__all__ = ["attach_gradient"]
 
 _CHUNK = 64
 """Frames treated at a time."""
 
-_ROUNDS = 200
-"""Largest number of products with the curvature."""
-
-_ACCURATE = {torch.float32: 1e-6, torch.float64: 1e-10}
-"""A frame is done when the slope that is left is this share of the first."""
+_ROUNDS, _ACCURATE = 200, 1e-8
+"""Largest number of products with the curvature; a frame is done when this share of its slope is left."""
 
 _RIDGE = 1e-13
+"""What a turn by one radian costs, as the square of an error of every vertex [m]: gradients of what the target
+does not determine stay finite."""
+
 _DAMPING = 1e-6
-"""What a turn by one radian costs as the square of an error of every vertex [m], so that gradients of what the target does not
-determine stay finite; and what the moments' matrix is damped by, relative to its diagonal."""
+"""Of the moments' matrix, relative to its diagonal."""
+
+_NEAR = 1e-4
+"""A Newton step that turns a joint or moves the body by less [rad, m] is taken before the derivative."""
 
 
 def attach_gradient(
@@ -41,13 +43,13 @@ def attach_gradient(
 ) -> tuple[Tensor, Tensor]:
     """Rotations and translation of a fit as differentiable functions of its target.
 
-    At a minimum the slope ``g(pose, x) = J^T O (y - x)``, terms included, is zero, hence
-    ``d pose = H^-1 J^T O dx`` with the exact second derivative H of half the error: J^T O J, the curvature that the
-    residual adds, and the terms. The system is solved by conjugate gradients with the moments' matrix as
-    preconditioner.
+    At a minimum the slope ``g(pose, x) = J^T O (y - x)``, priors included, is zero, hence
+    ``d pose = H^-1 J^T O dx`` with the exact second derivative H of half the error: J^T O J, the curvature
+    that the residual adds, and that of the priors. The system is solved in float64 by conjugate gradients with
+    the moments' matrix as preconditioner, at the minimum next to the fit.
 
-    Frames that are not valid get no gradient. Nor do frames whose error curves downwards somewhere, which are not at
-    a minimum and have no derivative: a ``RuntimeWarning`` in the backward pass names them.
+    Frames that are not valid get no gradient. Nor do frames whose error curves downwards, which are not at a
+    minimum and have no derivative: a ``RuntimeWarning`` in the backward pass names them.
 
     Args:
         vertices: targets (F, v, 3) [m] that the fit was made for.
@@ -72,13 +74,13 @@ class _Implicit(torch.autograd.Function):
         model, problem, valid = ctx.parts
         frames = *ctx.saved_tensors, by_rotations, by_translation, valid
         grads, good = [], []
-        for first in range(0, len(valid), _CHUNK):
+        for first in range(0, len(valid), _CHUNK) or (0,):
             chunk = slice(first, first + _CHUNK)
             moved, fine = _pull_back(model, problem(chunk), *(one[chunk] for one in frames))
             grads.append(moved)
             good.append(fine)
-        _warn(torch.cat(good) if good else valid)
-        return torch.cat(grads) if grads else None, None, None, None
+        _warn(torch.cat(good))
+        return torch.cat(grads), None, None, None
 
 
 def _pull_back(
@@ -93,27 +95,22 @@ def _pull_back(
     """Gradient (F, v, 3) by the target of a chunk of frames, and whether each frame has one."""
     eye = model.solver.eye.expand(len(rotations), 1, 3, 3)
     pose = Pose.begin(torch.cat((eye, rotations), 1), translation - problem.origin)
-    turns, _ = model.solver.walk(pose, problem.rest)
-    slope = slope_of_cotangents(model, rotations, turns, by_rotations, by_translation)
-    system = _System(model, problem, pose, turns, model.curvature(problem, pose))
+    system = _System.at(model, problem, pose)
+    step, near = system.solve(-system.slope)
+    near = near & (step.abs().amax((1, 2)) < _NEAR)
+    step = torch.where(near[:, None, None], step, 0.0)
+    system = _System.at(model, problem, model.solver.retract(system.pose, system.turns, step))
+    slope = _slope(system, by_rotations.double(), by_translation.double())
     motion, good = system.solve(torch.where(valid[:, None, None], slope, 0.0))
-    moved = system.curvature.moved(motion) * problem.weights[..., None]
+    moved = problem.weights[..., None] * system.pulled(motion).to(rotations)
     return torch.where(valid[:, None, None], moved, 0.0), good | ~valid
 
 
-def slope_of_cotangents(
-    model: ForwardModel, rotations: Tensor, turns: Tensor, by_rotations: Tensor, by_translation: Tensor
-) -> Tensor:
-    """Derivative (F, n + 1, 3) by turns in world axes, and by the translation, from that by matrix entries.
-
-    Args:
-        model: whose variables count.
-        rotations: (F, J - 1, 3, 3) T-pose-relative.
-        turns: world turns, the virtual root's included, (F, J or more, 3, 3).
-        by_rotations, by_translation: derivatives (F, J - 1, 3, 3) and (F, 3).
-    """
-    n = model.solver.variables
-    product = rotations[:, n - 1] @ by_rotations[:, n - 1].mT
+def _slope(system: _System, by_rotations: Tensor, by_translation: Tensor) -> Tensor:
+    """Derivative (F, n + 1, 3) by turns in world axes, and by the translation, from that by matrix entries."""
+    solver = system.model.solver
+    n = solver.variables
+    product = system.pose.relative[:, n] @ by_rotations[:, n - 1].mT
     torque = torch.stack(
         (
             product[..., 1, 2] - product[..., 2, 1],
@@ -122,82 +119,99 @@ def slope_of_cotangents(
         ),
         -1,
     )
-    torque = (turns[:, model.solver.parents[n]] @ torque[..., None]).squeeze(-1)
+    torque = (system.turns[:, solver.parents[n]] @ torque[..., None]).squeeze(-1)
     return torch.cat((torque, by_translation[:, None]), 1)
 
 
-@dataclass(frozen=True, kw_only=False, eq=False)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class _System:
-    """The second derivative of half the error, terms included, at poses; hinges turn about their axis alone."""
+    """Half the second derivative of what a fit lowers, at poses; hinges turn about their axis alone.
+
+    Attributes:
+        pose: in float64.
+        turns: world turns of the joints that it holds.
+        slope: half the first derivative (F, n + 1, 3).
+        inverse: about that of the matrix.
+    """
 
     model: ForwardModel
     problem: Problem
     pose: Pose
     turns: Tensor
     curvature: Curvature
+    priors: Priors
+    slope: Tensor
+    inverse: Callable[[Tensor], Tensor]
+
+    @classmethod
+    def at(cls, model: ForwardModel, problem: Problem, pose: Pose) -> _System:
+        kind = problem.origin.dtype
+        rough = replace(pose, relative=pose.relative.to(kind), translation=pose.translation.to(kind))
+        pose = replace(pose, relative=pose.relative.double(), translation=pose.translation.double())
+        turns, _ = model.solver.walk_public(pose, problem.rest.offsets.double())
+        curvature = model.curvature(problem, pose)
+        mass = problem.weights.sum(1).expand(len(turns))
+        priors = Priors(model.solver, problem, pose, turns, curvature)
+        inverse = model.inverse(
+            problem, rough, model.view(problem, rough), torch.full_like(mass, _DAMPING), mass
+        )
+        return cls(
+            model=model, problem=problem, pose=pose, turns=turns, curvature=curvature, priors=priors,
+            slope=priors.slope, inverse=lambda slope: inverse(slope.to(kind)).double(),
+        )  # fmt: skip
+
+    def pulled(self, motion: Tensor) -> Tensor:
+        """Gradient (F, v, 3) by the target of a motion's derivative, vertex weights left out."""
+        return self.priors.pulled(motion)
+
+    def times(self, motion: Tensor) -> Tensor:
+        """The matrix times a motion (F, n + 1, 3)."""
+        ridge = _RIDGE * self.problem.weights.double().sum(1)[:, None, None]
+        return self.free(self.priors.times(motion) + ridge * motion)
+
+    def free(self, motion: Tensor) -> Tensor:
+        """The part of a motion that hinges allow."""
+        terms = self.problem.terms
+        if terms is None:
+            return motion
+        solver = self.model.solver
+        above = self.turns[:, solver.parents[solver.variables]]
+        axis = (above @ terms.hinge_axis.double()[..., None]).squeeze(-1)
+        along = (motion[:, :-1] * axis).sum(-1, keepdim=True) * axis
+        hinge = (terms.hinge_axis != 0).any(-1)[:, None]
+        return torch.cat((torch.where(hinge, along, motion[:, :-1]), motion[:, -1:]), 1)
 
     def solve(self, slope: Tensor) -> tuple[Tensor, Tensor]:
         """Motions (F, n + 1, 3) that the matrix maps to slopes, and (F,) whether it is positive on the way."""
-        problem, kind = self.problem, slope.dtype
-        mass = problem.weights.sum(1).expand(len(slope))
-        view = self.model.view(problem, self.pose)
-        damping = torch.full_like(mass, _DAMPING)
-        inverse = self.model.inverse(problem, self.pose, view, damping, mass)
-        blocks = None if problem.terms is None else _term_blocks(self, problem.terms, mass)
-        ridge = (_RIDGE * mass)[:, None, None]
-        left = self._free(slope)
-        motion, good = torch.zeros_like(left), torch.ones_like(mass, dtype=torch.bool)
-        near = self._free(inverse(left))
-        way, size = near, _inner(left, near)
-        enough = _ACCURATE[kind] ** 2 * _inner(left, left)
+        left = self.free(slope)
+        motion, good = torch.zeros_like(left), torch.ones(len(left), dtype=torch.bool, device=left.device)
+        way = near = self.free(self.inverse(left))
+        size, enough = _inner(left, near), _ACCURATE**2 * _inner(left, left)
         moving = size > 0
         for _ in range(_ROUNDS):
             if not bool(moving.any()):
                 break
-            bent = self.curvature.times(way) + ridge * way
-            if blocks is not None:
-                bent[:, :-1] += (blocks @ way[:, :-1, :, None]).squeeze(-1)
-            bent = self._free(bent)
+            bent = self.times(way)
             curved = _inner(way, bent)
             good = good & ~(moving & ~(curved > 0))
             moving = moving & good
-            step = torch.where(moving, size / torch.where(moving, curved, 1.0), 0.0)[:, None, None]
+            step = _quotient(size, curved, moving)
             motion, left = motion + step * way, left - step * bent
-            near = self._free(inverse(left))
+            near = self.free(self.inverse(left))
             new = _inner(left, near)
             moving = moving & (_inner(left, left) > enough)
-            way = near + torch.where(moving, new / torch.where(moving, size, 1.0), 0.0)[:, None, None] * way
+            way = near + _quotient(new, size, moving) * way
             size = new
         return torch.where(good[:, None, None], motion, 0.0), good
-
-    def _free(self, motion: Tensor) -> Tensor:
-        """The part of a motion that hinges allow."""
-        terms = self.problem.terms
-        return motion if terms is None else self.model.solver._along_hinges(motion, self.turns, terms)
 
 
 def _inner(one: Tensor, other: Tensor) -> Tensor:
     return (one * other).sum((1, 2))
 
 
-def _term_blocks(system: _System, terms: JointTerms, mass: Tensor) -> Tensor:
-    """Half the second derivative of the terms, (F, n, 3, 3) by world turns.
-
-    Along the arc back a term is quadratic; across it, it curves with ``(angle - free) / (2 tan(angle / 2))``.
-    """
-    n = system.model.solver.variables
-    relative = system.pose.relative[:, n]
-    axis, over, angle = terms._deviation(relative)
-    above = system.turns[:, system.model.solver.parents[n]]
-    world = (above[:, terms.variable] @ axis[..., None]).squeeze(-1)
-    small = angle < 1e-4
-    round_arc = torch.where(small, 1.0, 0.5 * over / torch.tan(0.5 * torch.where(small, 1.0, angle)))
-    across = terms.stiffness * torch.where(small & (terms.free > 0), 0.0, round_arc)
-    along = torch.where((over > 0) | (terms.free == 0), terms.stiffness.expand_as(across), 0.0)
-    eye = system.model.solver.eye
-    outer = world[..., :, None] * world[..., None, :]
-    block = across[..., None, None] * eye + (along - across)[..., None, None] * outer
-    return mass[:, None, None, None] * torch.zeros_like(relative).index_add(1, terms.variable, block)
+def _quotient(above: Tensor, below: Tensor, where: Tensor) -> Tensor:
+    """(F, 1, 1), zero elsewhere."""
+    return torch.where(where, above / torch.where(where, below, 1.0), 0.0)[:, None, None]
 
 
 def _warn(good: Tensor) -> None:
@@ -206,7 +220,7 @@ def _warn(good: Tensor) -> None:
     bad = torch.nonzero(~good).flatten().tolist()
     warnings.warn(
         f"{len(bad)} of {len(good)} frames got no gradient through the fit, the first is {bad[0]}: their error "
-        "curves downwards where they rest, which is no minimum. Fit with more steps (refreshes), or leave them out.",
+        "curves downwards where they rest, which is no minimum. Give the fit more steps, or leave them out.",
         RuntimeWarning,
         stacklevel=2,
     )

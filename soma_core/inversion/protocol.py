@@ -17,14 +17,24 @@ class Curvature(Protocol):
     """How the error of some poses curves, about where they are.
 
     Motions (F, n + 1, 3) are turns of the variable joints in world axes, the translation last, as steps of
-    :meth:`GaussNewton.retract` are.
+    :meth:`GaussNewton.retract` are. Everything is in float64.
+
+    Attributes:
+        energy: the error, (F,) [m^2].
+        slope: half its derivative (F, n + 1, 3).
     """
+
+    energy: Tensor
+    slope: Tensor
 
     def times(self, motion: Tensor) -> Tensor:
         """Half the second derivative of the error, times a motion; terms are left out."""
 
     def moved(self, motion: Tensor) -> Tensor:
         """Velocities (F, v, 3) of the vertices in a motion."""
+
+    def residual(self) -> Tensor:
+        """What is left of the targets, (F, v, 3) [m]."""
 
 
 class ForwardModel(Protocol):
@@ -35,7 +45,8 @@ class ForwardModel(Protocol):
     """
 
     @property
-    def solver(self) -> GaussNewton: ...
+    def solver(self) -> GaussNewton:
+        """Turns slopes into steps, and steps into poses."""
 
     def view(self, problem: Problem, pose: Pose, bound: Tensor | None = None) -> View:
         """Error of poses, and its exact derivative; residuals beyond `bound` (F,) [m] count linearly."""
