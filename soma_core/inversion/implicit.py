@@ -28,8 +28,15 @@ does not determine stay finite."""
 _DAMPING = 1e-6
 """Of the moments' matrix, relative to its diagonal."""
 
-_NEAR = 1e-4
-"""A Newton step that turns a joint or moves the body by less [rad, m] is taken before the derivative."""
+_STEPS, _FINE, _LONGEST = 3, 1e-9, 0.05
+"""Newton steps from the fit to the minimum, how near that is as a root mean square over the vertices [m], and how
+far a step may go [rad, m]."""
+
+_EXACT, _FOLDED, _INDEFINITE = 0, 1, 2
+_TROUBLE = {
+    _FOLDED: "got the gradient of one side: they rest in a fold of the model, such as where a corrective sets in",
+    _INDEFINITE: "got no gradient: their error curves downwards where they rest, which is no minimum",
+}
 
 
 def attach_gradient(
@@ -48,8 +55,9 @@ def attach_gradient(
     that the residual adds, and that of the priors. The system is solved in float64 by conjugate gradients with
     the moments' matrix as preconditioner, at the minimum next to the fit.
 
-    Frames that are not valid get no gradient. Nor do frames whose error curves downwards, which are not at a
-    minimum and have no derivative: a ``RuntimeWarning`` in the backward pass names them.
+    Frames that are not valid get no gradient. Frames whose error curves downwards, which are not at a minimum,
+    get none either, and frames that rest in a fold of the model that of one side: a ``RuntimeWarning`` in the
+    backward pass counts and names both. Exact targets have neither.
 
     Args:
         vertices: targets (F, v, 3) [m] that the fit was made for.
@@ -73,13 +81,13 @@ class _Implicit(torch.autograd.Function):
     def backward(ctx, by_rotations, by_translation):
         model, problem, valid = ctx.parts
         frames = *ctx.saved_tensors, by_rotations, by_translation, valid
-        grads, good = [], []
+        grads, states = [], []
         for first in range(0, len(valid), _CHUNK) or (0,):
             chunk = slice(first, first + _CHUNK)
-            moved, fine = _pull_back(model, problem(chunk), *(one[chunk] for one in frames))
+            moved, state = _pull_back(model, problem(chunk), *(one[chunk] for one in frames))
             grads.append(moved)
-            good.append(fine)
-        _warn(torch.cat(good))
+            states.append(state)
+        _warn(torch.cat(states))
         return torch.cat(grads), None, None, None
 
 
@@ -92,18 +100,15 @@ def _pull_back(
     by_translation: Tensor,
     valid: Tensor,
 ) -> tuple[Tensor, Tensor]:
-    """Gradient (F, v, 3) by the target of a chunk of frames, and whether each frame has one."""
+    """Gradient (F, v, 3) by the target of a chunk of frames, and what each is (F,)."""
     eye = model.solver.eye.expand(len(rotations), 1, 3, 3)
     pose = Pose.begin(torch.cat((eye, rotations), 1), translation - problem.origin)
-    system = _System.at(model, problem, pose)
-    step, near = system.solve(-system.slope)
-    near = near & (step.abs().amax((1, 2)) < _NEAR)
-    step = torch.where(near[:, None, None], step, 0.0)
-    system = _System.at(model, problem, model.solver.retract(system.pose, system.turns, step))
+    system, smooth = _System.at(model, problem, pose).settled()
     slope = _slope(system, by_rotations.double(), by_translation.double())
     motion, good = system.solve(torch.where(valid[:, None, None], slope, 0.0))
     moved = problem.weights[..., None] * system.pulled(motion).to(rotations)
-    return torch.where(valid[:, None, None], moved, 0.0), good | ~valid
+    state = torch.where(good, torch.where(smooth, _EXACT, _FOLDED), _INDEFINITE)
+    return torch.where(valid[:, None, None], moved, 0.0), state * valid
 
 
 def _slope(system: _System, by_rotations: Tensor, by_translation: Tensor) -> Tensor:
@@ -160,6 +165,34 @@ class _System:
             slope=priors.slope, inverse=lambda slope: inverse(slope.to(kind)).double(),
         )  # fmt: skip
 
+    def settled(self) -> tuple[_System, Tensor]:
+        """The same at the minimum next to the poses, and (F,) whether steps led there."""
+        system, solver, off = self, self.model.solver, self.decrement()
+        smooth = torch.ones_like(off, dtype=torch.bool)
+        for _ in range(_STEPS):
+            wanted = smooth & (off > _FINE)
+            if not bool(wanted.any()):
+                break
+            step, good = system.solve(torch.where(wanted[:, None, None], -system.slope, 0.0))
+            step = torch.where((step.abs().amax((1, 2)) < _LONGEST)[:, None, None], step, 0.0)
+            trial = _System.at(self.model, self.problem, solver.retract(system.pose, system.turns, step))
+            reached = trial.decrement()
+            smooth = smooth & ~(wanted & good & (reached > 0.5 * off))
+            better = reached < off
+            pose = system.pose
+            if bool((wanted & ~better).any()):
+                kept = torch.where(better[:, None, None, None], trial.pose.relative, pose.relative)
+                place = torch.where(better[:, None], trial.pose.translation, pose.translation)
+                trial = _System.at(self.model, self.problem, replace(pose, relative=kept, translation=place))
+            system, off = trial, trial.decrement()
+        return system, smooth
+
+    def decrement(self) -> Tensor:
+        """How far a Newton step would move the vertices, about, as a root mean square (F,) [m]."""
+        slope = self.free(self.slope)
+        gain = _inner(slope, self.free(self.inverse(slope))).clamp_min(0)
+        return (gain / self.problem.weights.double().sum(1)).sqrt()
+
     def pulled(self, motion: Tensor) -> Tensor:
         """Gradient (F, v, 3) by the target of a motion's derivative, vertex weights left out."""
         return self.priors.pulled(motion)
@@ -214,13 +247,10 @@ def _quotient(above: Tensor, below: Tensor, where: Tensor) -> Tensor:
     return torch.where(where, above / torch.where(where, below, 1.0), 0.0)[:, None, None]
 
 
-def _warn(good: Tensor) -> None:
-    if bool(good.all()):
-        return
-    bad = torch.nonzero(~good).flatten().tolist()
-    warnings.warn(
-        f"{len(bad)} of {len(good)} frames got no gradient through the fit, the first is {bad[0]}: their error "
-        "curves downwards where they rest, which is no minimum. Give the fit more steps, or leave them out.",
-        RuntimeWarning,
-        stacklevel=2,
-    )
+def _warn(states: Tensor) -> None:
+    for state, trouble in _TROUBLE.items():
+        frames = torch.nonzero(states == state).flatten().tolist()
+        if frames:
+            named = ", ".join(map(str, frames[:5])) + (", ..." if len(frames) > 5 else "")
+            text = f"{len(frames)} of {len(states)} frames ({named}) {trouble}"
+            warnings.warn(text, RuntimeWarning, stacklevel=2)
