@@ -1,8 +1,8 @@
 """All lists of the native solver: the tree, the sparse step, and internal coordinates of a pose.
 
-An internal coordinate is one number that follows from the pose: a twist angle that turns helpers, or a mode of
-what the pose adds to the rest shape. With A its derivative by the turns of the joints and S its coupling to
-them through skin, all coordinates together add ``Y A + (Y A)^T`` to the Gauss-Newton matrix, where
+An internal coordinate is one number that follows from the pose: a twist angle that turns helpers, or a mode
+of what the pose adds to the rest shape. With A its derivative by the turns of the joints and S its coupling
+to them through skin, all coordinates together add ``Y A + (Y A)^T`` to the Gauss-Newton matrix, where
 ``Y = S + A^T G / 2`` and G holds the coordinates' own products.
 """
 
@@ -21,7 +21,7 @@ from soma_core.inversion.structure import MomentStructure
 __all__ = ["SolverTables", "solver_tables"]
 
 _SMALL = 1e-3
-"""Products of modes, and their moments on a joint's cloud, that are smaller relative to the largest are left out."""
+"""Relative to the largest: smaller products of modes, and moments on a joint's cloud, are left out."""
 
 _DIAGONAL, _BELOW, _TURNED = 0, 1, 2
 """Where ``Y_i A_j^T`` goes: a diagonal block, block (i, j), or transposed into block (j, i)."""
@@ -71,9 +71,7 @@ def solver_tables(
     free = {int(joint) for joint in structure.variables if joint < public}
     twists = _Twists(structure, driven, free)
     modes = _Modes(structure, driven, offsets, free)
-    plan = elimination_plan(
-        structure, public_count=public, coupled={*twists.coupled(), *modes.coupled()}
-    )
+    plan = elimination_plan(structure, public_count=public, coupled={*twists.coupled(), *modes.coupled()})
     slots = _Slots(plan)
     lists = {name: value for name, value in vars(plan).items() if isinstance(value, np.ndarray)}
     lists |= {"parents": structure.parents, "weighted": structure.joints, "pairs": structure.pairs.ravel()}
@@ -109,9 +107,7 @@ class _Twists:
         met = [t for helper in self._helpers(channel) for t in self.near.get(helper, ())]
         above = self.structure.ancestors[:, met].any(1) if met else np.zeros(0, bool)
         others = [
-            other
-            for other in range(self.counts["channel_count"])
-            if set(self._helpers(other)) & set(met)
+            other for other in range(self.counts["channel_count"]) if set(self._helpers(other)) & set(met)
         ]
         own = {int(i) for i in np.flatnonzero(above)} & self.free
         return sorted(own | {joint for other in others for joint in self.chains[other]})
@@ -202,7 +198,10 @@ class _Modes:
         self.sizes = [int((np.einsum("kk->k", gram[p, :, p]) > 0).sum()) for p in range(blocks)]
         largest = np.abs(gram).max()
         near = np.abs(gram).max((1, 3)) > _SMALL * largest
-        moments = [one.double().cpu().numpy().reshape(-1, 3, blocks, width) for one in (offsets.torque, offsets.force)]
+        moments = [
+            one.double().cpu().numpy().reshape(-1, 3, blocks, width)
+            for one in (offsets.torque, offsets.force)
+        ]
         self.moments = np.stack(moments, 1)  # (T, 2, 3, P, K)
         sizes = [np.linalg.norm(one, axis=1).max(-1) for one in moments]
         touch = np.logical_or(*(one > _SMALL * one.max() for one in sizes))
@@ -225,7 +224,9 @@ class _Modes:
         if self.driven is not None:
             chain, mix = self.driven.chain.cpu().numpy(), self.driven.mix.cpu().numpy()
             helpers = [i - self.driven.public_count for i in rows if i >= self.driven.public_count]
-            rows |= {int(j) for h in helpers for c in np.flatnonzero(mix[h]) for j in np.flatnonzero(chain[c])}
+            rows |= {
+                int(j) for h in helpers for c in np.flatnonzero(mix[h]) for j in np.flatnonzero(chain[c])
+            }
         return sorted(rows & self.free)
 
     def coupled(self) -> Iterable[tuple[int, int]]:
@@ -240,42 +241,74 @@ class _Modes:
     def tables(self, slots: _Slots) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
         if self.offsets is None:
             return {}, {}
-        offsets, blocks = self.offsets, len(self.rows)
-        count, activations = len(offsets.left), offsets.shapes.shape[1]
+        offsets, blocks, size = self.offsets, range(len(self.rows)), self.sizes
+        activations = offsets.shapes.shape[1]
         taken = [[int(c) for c in row if c < activations] for row in offsets.taken.cpu().numpy()]
-        gate = offsets.gate.double().cpu().numpy()
-        modes = offsets.modes.double().cpu().numpy()
         place = [{joint: k for k, joint in enumerate(rows)} for rows in self.rows]
         tree = [{joint: k for k, joint in enumerate(one)} for one in self.trees]
-        parents = self.structure.parents
-        trees = [
-            [(j, tree[p].get(int(parents[j]), -1), place[p].get(j, -1)) for j in self.trees[p]] for p in range(blocks)
-        ]  # fmt: skip
-        clouds = [[(tree[p][int(self.structure.joints[t])],) for t in self.clouds[p]] for p in range(blocks)]
-        folds = [self._folds(p, place[p], tree[p]) for p in range(blocks)]
+        folds = [self._folds(p, place[p], tree[p]) for p in blocks]
         reads = [
-            [(k, j, place[p].get(j, -1)) for k, j in enumerate(self.columns[p]) if j in self.free] for p in range(blocks)
-        ]  # fmt: skip
-        applies = [
-            [(place[p][i], k, *slots.meet(i, j)) for i in self.rows[p] for k, (_, j, _) in enumerate(reads[p])]
-            for p in range(blocks)
-        ]
-        nears = [
-            [(q, [place[p][j] for _, j, _ in reads[q]]) for q in self.near[p]] for p in range(blocks)
+            [(k, j, place[p].get(j, -1)) for k, j in enumerate(self.columns[p]) if j in self.free]
+            for p in blocks
         ]
         used = sorted({j for row in self.columns for j in row})
         lists = {
-            "mode_size": np.array(self.sizes),
-            "taken_start": _starts(taken), "taken": np.concatenate(taken),
+            "mode_size": np.array(size), "taken_start": _starts(taken), "taken": np.concatenate(taken),
+            **self._tree_lists(place, tree),
+            "fold_start": _starts(folds), "fold_tree": _flat(folds, 0), "fold_helper": _flat(folds, 1),
+            "fold_channel": _flat(folds, 2), "fold_row": _flat(folds, 3),
+            **self._read_lists(slots, place, reads, used),
+        }  # fmt: skip
+        numbers = {**self._numbers(taken, used), "fold_value": _flat(folds, 4, float)}
+        most = max(blocks, key=lambda p: size[p] * len(self.trees[p]))
+        self.counts = {
+            "block_count": len(blocks), "feature_columns": offsets.columns, "used_count": len(used),
+            "activation_count": activations, "feature_joints": len(offsets.left),
+            "response_size": int(lists["response_start"][-1]),
+            "mode_rows": max(s * 3 * (len(r) + 1) for s, r in zip(size, self.rows, strict=True)),
+            "mode_tree": size[most] * 6 * len(self.trees[most]),
+        }  # fmt: skip
+        return lists, numbers
+
+    def _tree_lists(
+        self, place: Sequence[Mapping[int, int]], tree: Sequence[Mapping[int, int]]
+    ) -> dict[str, np.ndarray]:
+        """Of every block: its tree, and which of its joints carry clouds that its modes move."""
+        parents, joints, blocks = self.structure.parents, self.structure.joints, range(len(self.rows))
+        trees = [
+            [(j, tree[p].get(int(parents[j]), -1), place[p].get(j, -1)) for j in self.trees[p]]
+            for p in blocks
+        ]
+        clouds = [[(tree[p][int(joints[t])],) for t in self.clouds[p]] for p in blocks]
+        return {
+            "tree_start": _starts(trees), "tree_joint": _flat(trees, 0), "tree_up": _flat(trees, 1),
+            "tree_row": _flat(trees, 2), "cloud_start": _starts(clouds), "cloud_tree": _flat(clouds, 0),
+        }  # fmt: skip
+
+    def _read_lists(
+        self,
+        slots: _Slots,
+        place: Sequence[Mapping[int, int]],
+        reads: Sequence[Sequence[tuple[int, int, int]]],
+        used: Sequence[int],
+    ) -> dict[str, np.ndarray]:
+        """Of every block: the joints that its modes read, and where products with them go."""
+        blocks = range(len(self.rows))
+        applies = [
+            [
+                (place[p][i], k, *slots.meet(i, j))
+                for i in self.rows[p]
+                for k, (_, j, _) in enumerate(reads[p])
+            ]
+            for p in blocks
+        ]
+        nears = [[(q, [place[p][j] for _, j, _ in reads[q]]) for q in self.near[p]] for p in blocks]
+        sizes = [3 * s * len(r) for s, r in zip(self.sizes, reads, strict=True)]
+        return {
             "read_start": _starts(reads),
             "read_used": np.array([used.index(j) for one in reads for _, j, _ in one]),
             "read_column": np.array([slots.column[j] for one in reads for _, j, _ in one]),
-            "response_start": np.cumsum([0, *(s * len(r) * 3 for s, r in zip(self.sizes, reads, strict=True))]),
-            "tree_start": _starts(trees), "tree_joint": _flat(trees, 0), "tree_up": _flat(trees, 1),
-            "tree_row": _flat(trees, 2),
-            "cloud_start": _starts(clouds), "cloud_tree": _flat(clouds, 0),
-            "fold_start": _starts(folds), "fold_tree": _flat(folds, 0), "fold_helper": _flat(folds, 1),
-            "fold_channel": _flat(folds, 2), "fold_row": _flat(folds, 3),
+            "response_start": np.cumsum([0, *sizes]),
             "mode_row_count": np.array([len(rows) for rows in self.rows]),
             "apply_start": _starts(applies), "apply_row": _flat(applies, 0), "apply_read": _flat(applies, 1),
             "apply_block": _flat(applies, 2), "apply_kind": _flat(applies, 3),
@@ -283,30 +316,25 @@ class _Modes:
             "near_rows": np.array([r for one in nears for _, rows in one for r in rows]),
             "used_joint": np.array(used),
         }  # fmt: skip
-        size = self.sizes
-        kept = [[k for k, j in enumerate(self.columns[p]) if j in self.free] for p in range(blocks)]
-        numbers = {
-            "gate": _joined(gate[p, : len(taken[p])][:, kept[p]] for p in range(blocks)),
-            "mode": _joined(modes[p, : size[p], : len(taken[p])] for p in range(blocks)),
+
+    def _numbers(self, taken: Sequence[Sequence[int]], used: Sequence[int]) -> dict[str, np.ndarray]:
+        """Of every block: how its activations read features, its modes, and their moments and products."""
+        assert self.offsets is not None
+        offsets, blocks, size = self.offsets, range(len(self.rows)), self.sizes
+        gate, modes, left, right = (
+            one.double().cpu().numpy() for one in (offsets.gate, offsets.modes, offsets.left, offsets.right)
+        )
+        kept = [[k for k, j in enumerate(self.columns[p]) if j in self.free] for p in blocks]
+        return {
+            "gate": _joined(gate[p, : len(taken[p])][:, kept[p]] for p in blocks),
+            "mode": _joined(modes[p, : size[p], : len(taken[p])] for p in blocks),
             "cloud_moment": _joined(
-                self.moments[t, :, :, p, : size[p]].transpose(2, 0, 1) for p in range(blocks) for t in self.clouds[p]
+                self.moments[t, :, :, p, : size[p]].transpose(2, 0, 1) for p in blocks for t in self.clouds[p]
             ),
-            "fold_value": _flat(folds, 4, float),
-            "gram": _joined(
-                self.gram[p, : size[p], q, : size[q]] for p in range(blocks) for q in self.near[p]
-            ),
-            "left": offsets.left.double().cpu().numpy()[used].ravel(),
-            "right": offsets.right.double().cpu().numpy()[used][..., : offsets.columns].ravel(),
-        }  # fmt: skip
-        most = max(range(blocks), key=lambda p: size[p] * len(self.trees[p]))
-        self.counts = {
-            "block_count": blocks, "feature_columns": offsets.columns, "used_count": len(used),
-            "activation_count": activations, "feature_joints": count,
-            "response_size": sum(s * len(r) * 3 for s, r in zip(size, reads, strict=True)),
-            "mode_rows": max(s * 3 * (len(r) + 1) for s, r in zip(size, self.rows, strict=True)),
-            "mode_tree": size[most] * 6 * len(self.trees[most]),
-        }  # fmt: skip
-        return lists, numbers
+            "gram": _joined(self.gram[p, : size[p], q, : size[q]] for p in blocks for q in self.near[p]),
+            "left": left[used].ravel(),
+            "right": right[used][..., : offsets.columns].ravel(),
+        }
 
     def _folds(self, block: int, place: Mapping[int, int], tree: Mapping[int, int]) -> list[tuple]:
         """Of every helper in the block's tree: its rows are handed to the joints that drive it."""
