@@ -229,7 +229,7 @@ class SkinModel(torch.nn.Module):
             mass: (F,) sums of the vertex weights.
         """
         if self._steps is None:
-            matrix = self._with_terms(problem, pose, view.turns, view.places, view.activity)
+            matrix = self._with_terms(problem, pose, view.turns, view.places, view.activity, mass)
             return damped_inverse(matrix, damping)
         steps, factor = self._steps, self._factor(problem, pose, view.activity, damping, mass)
         return lambda slope: steps.solve(factor, slope)
@@ -241,10 +241,10 @@ class SkinModel(torch.nn.Module):
         """
         activity = None if self.offsets is None else self.offsets.activity(pose.relative)
         none = torch.zeros_like(pose.translation[:, 0])
+        mass = problem.weights.sum(1).expand(len(none))
         if self._steps is not None:
-            mass = problem.weights.sum(1).expand(len(none))
             return self._steps.variances(self._factor(problem, pose, activity, none, mass))
-        dense = self._with_terms(problem, pose, *self.walk(pose, problem.rest), activity)
+        dense = self._with_terms(problem, pose, *self.walk(pose, problem.rest), activity, mass)
         dense = dense.flatten(3, 4).flatten(1, 2)
         diagonal = dense.diagonal(dim1=-2, dim2=-1)
         diagonal += _RIDGE * diagonal.mean(1, keepdim=True)
@@ -267,12 +267,17 @@ class SkinModel(torch.nn.Module):
         )  # fmt: skip
 
     def _with_terms(
-        self, problem: Problem, pose: Pose, turns: Tensor, places: Tensor, activity: Activity | None
+        self,
+        problem: Problem,
+        pose: Pose,
+        turns: Tensor,
+        places: Tensor,
+        activity: Activity | None,
+        mass: Tensor,
     ) -> Tensor:
         """Matrix (F, n + 1, 3, n + 1, 3) of the model and the terms."""
         matrix = self._matrix(problem, pose, turns, places, activity)
         if problem.terms is not None:
-            mass = problem.weights.sum(1).expand(len(turns))
             slope = torch.zeros_like(matrix[:, 0, 0])
             self.solver.add_terms(matrix, slope, pose.relative, turns, problem.terms, mass)
         return matrix
