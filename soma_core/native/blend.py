@@ -1,89 +1,132 @@
-"""What pose blend shapes add to the Gauss-Newton matrix of skinning, from moments."""
+"""Pose blend shapes of a native model: measured where they are linear, differentiated by autograd where not."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from itertools import pairwise
+from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
-from soma_core.geometry.rotations import skew
-from soma_core.inversion.gauss_newton import GaussNewton
-from soma_core.inversion.moments import RestMoments, SkinMoments
+from soma_core.geometry.rotations import axis_angle_to_matrix
 
-__all__ = ["BlendMoments", "blend_shapes"]
+if TYPE_CHECKING:
+    from soma_core.inversion.problem import Pose, Problem, View
+    from soma_core.native.model import NativeRig
+
+__all__ = ["BlendedCurvature", "blend_shapes", "blended_view", "is_linear"]
 
 _BATCH = 64
 """Blend shapes evaluated at a time."""
 
+_ROUNDING = 64
+"""Multiples of the dtype's rounding, relative to the largest offset, that linear blend shapes may be off by."""
 
-class BlendMoments:
-    """Second moments of the blend shapes with each other and with the rest points of every joint.
-
-    A joint's turn moves vertices by skinning and by blend shapes: ``J = J_s + J_b``. The products
-    ``J_b^T J_b`` and ``J_s^T J_b`` are read from moments as if each influence moved a vertex of its own:
-    exact where vertices are rigid, and close elsewhere. Only the path to the minimum depends on it, since
-    energy and slope are those of the model.
-
-    Args:
-        shapes: (9 J, n, 3) from :func:`blend_shapes`.
-        moments: of the rig.
-        rest: of the body under `weights`.
-        weights: (n,) of the vertices.
-        above: (n_variables, T), 1 where a variable joint is a weighted one or lies above it.
-    """
-
-    def __init__(
-        self, shapes: Tensor, moments: SkinMoments, rest: RestMoments, weights: Tensor, above: Tensor
-    ) -> None:
-        flat = (shapes * weights.sqrt()[:, None]).flatten(1)
-        self._own = (flat @ flat.T).unflatten(0, (-1, 9)).unflatten(2, (-1, 9))  # (J, 9, J, 9)
-        self._above, pulls = above, []
-        for first, last in pairwise(moments.joint_start.tolist()):
-            moved = shapes[:, moments.influence_vertex[first:last]] * rest.weight[0, first:last, None]
-            torque = torch.einsum("mec,edc->md", moved, skew(rest.local[0, first:last]))
-            pulls.append(torch.stack((torque, moved.sum(1)), -1))
-        # Torque about each joint and force on it, in the joint's own axes: (J, 9, T, 3, 2).
-        self._pull = torch.stack(pulls, 1).unflatten(0, (-1, 9))
-
-    def matrix(self, relative: Tensor, turns: Tensor, places: Tensor, solver: GaussNewton) -> Tensor:
-        """What to add to the matrix (F, n + 1, 3, n + 1, 3) of :meth:`GaussNewton.normal_equations`.
-
-        Args:
-            relative: rotations of the pose, the virtual root's included, (F, J + 1, 3, 3).
-            turns, places: world turns and places of the joints, (F, J + 1, 3, 3) and (F, J + 1, 3).
-            solver: whose variables the matrix has.
-        """
-        n, count, frames = solver.variables, len(solver.variables), len(turns)
-        axes = turns[:, solver.parents[n]]  # row a: the world's axis a in the axes of the parent
-        change = (skew(axes) @ relative[:, n, None]).flatten(3)  # (F, n, 3, 9)
-        by_joint = change.permute(1, 0, 2, 3).flatten(1, 2)  # (n, 3 F, 9)
-        own = by_joint @ self._own[n - 1][:, :, n - 1].flatten(2)
-        own = own.unflatten(1, (-1, 3)).unflatten(3, (count, 9)).permute(1, 3, 0, 2, 4)
-        own = (own.flatten(2, 3) @ change.transpose(-1, -2)).unflatten(2, (count, 3))
-        pull = (by_joint @ self._pull[n - 1].flatten(2)).view(count, frames, 3, -1, 3, 2)
-        pull = turns[:, solver.joints] @ pull.permute(1, 3, 4, 0, 2, 5).flatten(3)  # (F, T, 3, n 3 2)
-        torque, force = pull.unflatten(3, (-1, 2)).unbind(-1)  # of each weighted joint, (F, T, 3, 3 n)
-        torque = torque + skew(places[:, solver.joints]) @ force
-        torque, force = ((self._above @ one.flatten(2)).view(frames, count, 3, -1) for one in (torque, force))
-        torque = torque - skew(places[:, n]) @ force  # of each subtree about its joint
-        total = pull.unflatten(3, (-1, 2))[..., 1].sum(1, keepdim=True)
-        cross = torch.cat((torque, total), 1).unflatten(3, (count, 3))  # (F, n + 1, 3, n, 3)
-        matrix = torch.nn.functional.pad(own.permute(0, 2, 3, 1, 4), (0, 0, 0, 1, 0, 0, 0, 1))
-        matrix[:, :, :, :count] += cross
-        matrix[:, :count] += cross.permute(0, 3, 4, 1, 2)
-        return matrix
+_STEP = 1e-4
+"""Largest turn [rad] and shift [m] of a central difference along one direction, in float64."""
 
 
-def blend_shapes(offsets: Callable[[Tensor], Tensor], still: Tensor) -> Tensor:
+def blend_shapes(
+    offsets: Callable[[Tensor], Tensor], joint_count: int, *, dtype: torch.dtype, device: torch.device | str
+) -> Tensor:
     """What each entry of each local rotation adds to the rest mesh, (9 J, n, 3).
 
     Args:
         offsets: maps local rotations (batch, J, 3, 3) to (batch, n, 3).
-        still: identity rotations (1, J, 3, 3).
+        joint_count: J.
     """
-    count = still.shape[1]
-    entries = torch.eye(9 * count).to(still).view(-1, count, 3, 3)
+    still = torch.eye(3, dtype=dtype, device=device).expand(1, joint_count, 3, 3)
+    entries = torch.eye(9 * joint_count, dtype=dtype, device=device).view(-1, joint_count, 3, 3)
     at_rest = offsets(still)
     return torch.cat([offsets(still + part) - at_rest for part in entries.split(_BATCH)])
+
+
+def is_linear(offsets: Callable[[Tensor], Tensor], shapes: Tensor) -> bool:
+    """Whether offsets are blend shapes (9 J, n, 3) times the change of the rotations, at poses far from rest."""
+    count = len(shapes) // 9
+    angles = torch.linspace(-2.5, 2.5, 6 * count).to(shapes).view(2, count, 3)
+    turned = axis_angle_to_matrix(torch.cat((0 * angles[:1], angles)))
+    change = turned - torch.eye(3).to(shapes)
+    found, told = offsets(turned), torch.einsum("bm,mvc->bvc", change.flatten(1), shapes)
+    close = _ROUNDING * torch.finfo(shapes.dtype).eps * float(found.abs().max())
+    return bool((found - told).abs().max() <= close)
+
+
+def blended_view(rig: NativeRig, problem: Problem, pose: Pose) -> View:
+    """Error of poses whose blend shapes are not linear, and its derivative by autograd."""
+    from soma_core.inversion.skin_model import SkinModel
+
+    motion = torch.zeros_like(pose.relative[:, : len(rig.solver.variables) + 1, 0]).requires_grad_()
+    turns, _ = rig.solver.walk(pose, problem.rest)
+    with torch.enable_grad():
+        energy = _energy(rig, problem, rig.solver.retract(pose, turns, motion))
+        (slope,) = torch.autograd.grad(0.5 * energy.sum(), motion)
+    view = SkinModel.view(rig, problem, pose)
+    return replace(view, energy=energy.detach().to(slope), slope=slope)
+
+
+class BlendedCurvature:
+    """Curvature of such a model at poses, by differences of its derivative; see :class:`Curvature`.
+
+    In float64 as far as the model itself is.
+
+    Args:
+        rig: the model.
+        problem: targets, weights and identity.
+        pose: about the problem's origin.
+
+    Attributes:
+        energy: of the poses, (F,) [m^2].
+        slope: half its derivative (F, n + 1, 3).
+    """
+
+    def __init__(self, rig: NativeRig, problem: Problem, pose: Pose) -> None:
+        self._rig, self._problem = rig, problem
+        kind = problem.origin.dtype
+        self._pose = replace(pose, relative=pose.relative.to(kind), translation=pose.translation.to(kind))
+        self._turns, _ = rig.solver.walk(self._pose, problem.rest)
+        # An ordinary difference of float32 slopes would lose half their digits.
+        self._step = _STEP if kind == torch.float64 else 3e-3
+        still = torch.zeros_like(self._turns[:, : len(rig.solver.variables) + 1, 0])
+        self.slope = self._slope(still).double()
+        self.energy = _energy(rig, problem, self._pose).double()
+
+    def times(self, motion: Tensor) -> Tensor:
+        """Half the second derivative of the error, times a motion (F, n + 1, 3)."""
+        return self._difference(self._slope, motion)
+
+    def moved(self, motion: Tensor) -> Tensor:
+        """Velocities (F, v, 3) of the vertices in a motion (F, n + 1, 3)."""
+        return self._difference(lambda step: _posed(self._rig, self._problem, self._near(step)), motion)
+
+    def residual(self) -> Tensor:
+        """What is left of the targets, (F, v, 3) [m]."""
+        problem = self._problem
+        there = _posed(self._rig, problem, self._pose) - (problem.vertices - problem.origin[:, None])
+        return there.double()
+
+    def _near(self, motion: Tensor) -> Pose:
+        return self._rig.solver.retract(self._pose, self._turns, motion)
+
+    def _slope(self, motion: Tensor) -> Tensor:
+        with torch.enable_grad():
+            at = motion.detach().requires_grad_()
+            half = 0.5 * _energy(self._rig, self._problem, self._near(at)).sum()
+            return torch.autograd.grad(half, at)[0]
+
+    def _difference(self, function: Callable[[Tensor], Tensor], motion: Tensor) -> Tensor:
+        length = motion.norm(dim=-1).amax(1)[:, None, None].clamp_min(1e-100)
+        way = (self._step * motion / length).to(self._problem.origin)
+        ahead, behind = (function(sign * way).double() for sign in (1, -1))
+        return (ahead - behind) * (length / (2 * self._step))
+
+
+def _posed(rig: NativeRig, problem: Problem, pose: Pose) -> Tensor:
+    """Vertices (F, n, 3) about the problem's origin."""
+    return rig.posed(problem.identity, pose.relative[:, 1:], pose.translation)
+
+
+def _energy(rig: NativeRig, problem: Problem, pose: Pose) -> Tensor:
+    step = _posed(rig, problem, pose) - (problem.vertices - problem.origin[:, None])
+    return (problem.weights * step.square().sum(-1)).double().sum(1)

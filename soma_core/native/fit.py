@@ -13,9 +13,8 @@ from soma_core.backends.parameters import batch_parameters
 from soma_core.errors import InputError
 from soma_core.geometry.rotations import matrix_to_axis_angle
 from soma_core.inversion._inputs import check_weights
+from soma_core.inversion.implicit import attach_gradient
 from soma_core.layer import Kernels
-from soma_core.native.blend import BlendMoments
-from soma_core.native.implicit import attach_gradient
 from soma_core.native.model import NativeBody, NativeRig
 from soma_core.native.motion import NativeMotion
 from soma_core.native.poses import PoseFit
@@ -41,8 +40,8 @@ class NativeFit:
     """Recovers the pose parameters of a native model from posed SOMA bodies; keeps no state between calls.
 
     Canonical vertices go to the native topology, and the model's own pose is fitted to them: aligned
-    joint by joint, then by Levenberg-Marquardt on the moments of its skinning, then under the whole model
-    with its pose blend shapes. Frames are fitted in batches, every joint of the model at once, hands
+    joint by joint, then by Levenberg-Marquardt on the moments of its skinning, then by descent on the error of
+    the whole model with its pose blend shapes. Frames are fitted in batches, every joint of the model at once, hands
     included.
 
     Args:
@@ -50,8 +49,8 @@ class NativeFit:
         options: the backend's own options, such as a gender.
         lod: of the canonical vertices that come in.
         iterations: largest number of steps under the whole model.
-        tolerance: a frame has converged when a step changes its root mean square error, squared, by less
-            than this, squared [m].
+        tolerance: a frame has converged when a step would change its vertices by less, as a root mean square
+            [m].
         device, dtype: of all constants and results.
         kernels: ``torch`` (the reference), ``warp`` or ``auto``.
         registry: where backends are looked up.
@@ -184,7 +183,7 @@ class NativeFit:
             return self.rig.bodies(rest, joints)
 
         point = fit_shape(
-            lambda point: self._prepared(named(point[None]), counted, first.blend),
+            lambda point: self._prepared(named(point[None]), counted),
             directions,
             torch.cat([value.flatten() for value in begin.values()]),
             target[known.any(1)],
@@ -222,13 +221,10 @@ class NativeFit:
         identity = self.rig.bodies(model.rest, model.joints)
         return NativeBody(params=params, identity=identity, pelvis=identity.bind_world[0, 1, :3, 3])
 
-    def _prepared(
-        self, params: Mapping[str, Tensor], weights: Tensor, blend: BlendMoments | None = None
-    ) -> PoseFit:
+    def _prepared(self, params: Mapping[str, Tensor], weights: Tensor) -> PoseFit:
         return PoseFit(
-            self.rig, self._body(params), weights, iterations=self.iterations, tolerance=self.tolerance,
-            blend=blend,
-        )  # fmt: skip
+            self.rig, self._body(params), weights, iterations=self.iterations, tolerance=self.tolerance
+        )
 
     def _fit(self, fit: PoseFit, target: Tensor) -> NativeMotion:
         """Fit a chunk of frames (F, n, 3) [m]."""
@@ -238,8 +234,12 @@ class NativeFit:
             pose = fit(near.detach())
         rotations, pelvis = pose.relative[:, 1:], pose.translation
         if torch.is_grad_enabled() and near.requires_grad:
-            rotations, pelvis = attach_gradient(near, pose, fit, valid)
-        posed = self.rig.posed(fit.body, rotations, pelvis)
+            target = near.detach()
+            rotations, pelvis = attach_gradient(
+                near, rotations, pelvis, model=self.rig, problem=lambda rows: fit.problem(target[rows]),
+                valid=valid,
+            )  # fmt: skip
+        posed = self.rig.posed(fit.body.identity, rotations, pelvis)
         error = torch.linalg.vector_norm(posed.detach() - near.detach(), dim=-1)
         residual = (error.square() @ fit.weights / fit.weights.sum()).sqrt()
         determined = torch.zeros(len(self.joint_names), dtype=torch.bool, device=self.device)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Mapping
 from dataclasses import dataclass
 
@@ -12,12 +11,14 @@ import torch
 from torch import Tensor
 
 from soma_core.animation.engine import Animation
-from soma_core.inversion.gauss_newton import GaussNewton
-from soma_core.inversion.moments import SkinMoments
-from soma_core.inversion.start import ProcrustesStart
-from soma_core.inversion.structure import skin_structure
+from soma_core.inversion.moments import RestMoments
+from soma_core.inversion.offsets import PoseOffsets
+from soma_core.inversion.problem import Pose, Problem, View
+from soma_core.inversion.protocol import Curvature
+from soma_core.inversion.skin_model import Kind, SkinModel
+from soma_core.inversion.structure import MomentStructure, skin_structure
 from soma_core.layer import Kernels
-from soma_core.native.blend import blend_shapes
+from soma_core.native.blend import BlendedCurvature, blend_shapes, blended_view, is_linear
 from soma_core.plugin.spec import SkinnedModel
 from soma_core.rig.skeleton import Rig
 from soma_core.skeleton.identity import Identity
@@ -61,8 +62,11 @@ class NativeBody:
     pelvis: Tensor
 
 
-class NativeRig(torch.nn.Module):
+class NativeRig(SkinModel):
     """The joints of a native model, in metres and native axes: poses bodies, and steps on their error.
+
+    Blend shapes that are linear in the entries of local rotations, which is measured once, are offsets of the
+    skin model. Others are evaluated by the model itself, and differentiated by autograd.
 
     Args:
         model: any body of it.
@@ -73,8 +77,7 @@ class NativeRig(torch.nn.Module):
     Attributes:
         joint_names: of the model's joints.
         blended: whether poses add to the rest mesh before it is skinned.
-        above: (n, T), 1 where a variable joint is a weighted one or lies above it.
-        animation, moments, solver, start: of the rig.
+        linear: whether that is linear in the entries of the rotations.
     """
 
     def __init__(
@@ -87,19 +90,20 @@ class NativeRig(torch.nn.Module):
         device: torch.device,
         kernels: Kernels,
     ) -> None:
-        super().__init__()
         rig = native_rig(model, scale)
         structure = skin_structure(rig, covered)
-        warp = kernels == "warp" or (kernels == "auto" and device.type == "cpu")
-        kind = {"dtype": dtype, "device": device}
-        self.joint_names, self._scale, self._offsets = rig.user_joint_names, scale, model.pose_offsets
-        self.blended = model.pose_offsets is not None
-        self.animation = Animation(rig, kernels=kernels, **kind)
-        self.moments = SkinMoments(structure, rig, warp=warp, **kind)
-        self.solver = GaussNewton(structure, warp=warp, **kind)
-        above = structure.ancestors[structure.variables][:, structure.joints]
-        self.register_buffer("above", torch.as_tensor(above, device=device).to(dtype), persistent=False)
-        self.start = ProcrustesStart(structure, **kind)
+        kind: Kind = {"dtype": dtype, "device": device}
+        blend, offsets, linear = model.pose_offsets, None, True
+        if blend is not None:
+            shapes = scale * blend_shapes(blend, len(model.joints[0]), **kind)
+            linear = is_linear(blend, shapes / scale)
+            offsets = _offsets(shapes, rig, structure, **kind)
+        super().__init__(
+            rig, structure, Animation(rig, kernels=kernels, **kind), offsets=offsets,
+            warp=kernels == "warp" or (kernels == "auto" and device.type == "cpu"), **kind,
+        )  # fmt: skip
+        self.joint_names, self.linear, self._scale, self._blend = rig.user_joint_names, linear, scale, blend
+        self.blended = blend is not None
 
     def bodies(self, rest: Tensor, joints: Tensor) -> Identity:
         """Rest meshes (batch, n, 3) and joints (batch, J, 3) in native units as identities [m]."""
@@ -108,25 +112,49 @@ class NativeRig(torch.nn.Module):
         bind[:, 1:, :3, 3] = places
         return Identity(rest=points, bind_world=bind, fitted_rest=points, fitted_world=bind)
 
-    def posed(self, body: NativeBody, rotations: Tensor, pelvis: Tensor) -> Tensor:
+    def posed(self, identity: Identity, rotations: Tensor, pelvis: Tensor) -> Tensor:
         """Vertices (F, n, 3) [m] under the whole model. Differentiable.
 
         Args:
-            body: which.
+            identity: of one body.
             rotations: local rotations (F, J, 3, 3).
             pelvis: places (F, 3) [m] of the root joint.
         """
-        bind = body.identity.bind_world
-        rest = body.identity.rest
-        if self._offsets is not None:
-            rest = rest + self._scale * self._offsets(rotations)
-        shaped = Identity(rest=rest, bind_world=bind, fitted_rest=rest, fitted_world=bind)
-        return self.animation.pose(shaped, rotations, pelvis, absolute=False).vertices
+        moves = None if self._blend is None else self._scale * self._blend(rotations)
+        posed = self.animation.pose(identity, rotations, pelvis, absolute=False, offsets=moves)
+        return posed.vertices
 
-    @functools.cached_property
-    def blend_shapes(self) -> Tensor:
-        """Blend shapes (9 J, n, 3) [m]; made when first asked for."""
-        assert self._offsets is not None
-        return self._scale * blend_shapes(
-            self._offsets, self.solver.eye.expand(1, len(self.joint_names), 3, 3)
+    def problem(
+        self, target: Tensor, identity: Identity, weights: Tensor, rest: RestMoments | None = None
+    ) -> Problem:
+        """The problem of finite targets (F, n, 3) [m] of one body under vertex weights (n,)."""
+        rest = self.rest(identity, weights[None]) if rest is None else rest
+        moments, origin = self.moments.target(target, rest)
+        return Problem(
+            vertices=target, weights=weights[None], identity=identity, rest=rest, target=moments, origin=origin
         )
+
+    def view(self, problem: Problem, pose: Pose, bound: Tensor | None = None) -> View:
+        """Error of poses, and its exact derivative; see :class:`ForwardModel`."""
+        if self.linear:
+            return super().view(problem, pose, bound)
+        assert bound is None
+        return blended_view(self, problem, pose)
+
+    def curvature(self, problem: Problem, pose: Pose) -> Curvature:
+        """The exact curvature of the error at poses."""
+        return super().curvature(problem, pose) if self.linear else BlendedCurvature(self, problem, pose)
+
+
+def _offsets(
+    shapes: Tensor, rig: Rig, structure: MomentStructure, *, dtype: torch.dtype, device: torch.device | str
+) -> PoseOffsets:
+    """Blend shapes (9 J, n, 3) [m] as offsets of the rig, whose joint 0 is a virtual root."""
+    count = len(rig.joint_names)
+    eyes = np.broadcast_to(np.eye(3), (count, 3, 3)).copy()
+    rows = shapes.double().cpu().permute(1, 2, 0).flatten(0, 1).numpy()  # (3 n, 9 J)
+    return PoseOffsets(
+        left=eyes, right=eyes, still=eyes, first=None, squash=False,
+        shapes=scipy.sparse.csr_array(np.pad(rows, ((0, 0), (9, 0)))), owner=np.arange(count).repeat(9),
+        rig=rig, joints=structure.joints, fitted=structure.fitted, dtype=dtype, device=device,
+    )  # fmt: skip

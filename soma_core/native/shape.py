@@ -77,19 +77,18 @@ def _doubt(fit: PoseFit, target: Tensor) -> float:
 def _step(fit: PoseFit, directions: Identity, pose: Pose, target: Tensor, away: Tensor) -> Tensor:
     """Gauss-Newton step (k,) once each frame follows with its best pose (the Schur complement)."""
     solver, moments, rest, count = fit.rig.solver, fit.rig.moments, fit.rest, len(away)
-    turns, places = solver.walk(pose, rest.offsets)
+    turns, places = solver.walk(pose, rest)
     residual = (fit.posed(pose) - target) * fit.weights[:, None]
     matrix = torch.eye(count, dtype=torch.float64, device=target.device) * _doubt(fit, target)
     slope = _doubt(fit, target) * away.double()
-    empty = turns.new_zeros(1, len(solver.joints), 3, 4)
     still = target.new_zeros(count, 3)
     for frame in range(len(target)):
         one = slice(frame, frame + 1)
         turned = pose.relative[one, 1:].expand(count, -1, 3, 3)
         columns = fit.rig.animation.pose(directions, turned, still, absolute=False).vertices
         many = turns[one].expand(count, -1, 3, 3), places[one].expand(count, -1, 3)
-        coupling = solver.slopes(*many, moments.of_vectors(columns, rest)).flatten(1)
-        own, _ = solver.normal_equations(turns[one], places[one], rest.second, empty)
+        coupling = solver.slopes(*many, rest, moments.of_vectors(columns, rest)).flatten(1)
+        own, _ = solver.normal_equations(turns[one], places[one], rest)
         own = own.flatten(3, 4).flatten(1, 2)[0]
         factor = torch.linalg.cholesky(own + _RIDGE * torch.diag(own.diagonal()))
         follow = torch.linalg.solve_triangular(factor, coupling.T, upper=False)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Literal
+
 import torch
 from torch import Tensor
 
@@ -11,12 +13,15 @@ from soma_core.plugin.spec import SkinnedModel
 
 __all__ = ["PARENTS", "make_fit", "make_model", "make_rig", "random_pose"]
 
+Blend = Literal["none", "linear", "curved"]
+"""What a pose adds to the rest mesh: nothing, or functions of the rotations' entries."""
+
 PARENTS = (-1, 0, 1, 2, 0, 4)
 _AROUND = 40
 _KIND = {"dtype": torch.float64, "device": torch.device("cpu")}
 
 
-def make_model(*, rigid: bool = False, blended: bool = True, betas: Tensor | None = None) -> SkinnedModel:
+def make_model(*, blend: Blend = "linear", betas: Tensor | None = None) -> SkinnedModel:
     """Two chains with clouds of vertices about their bones; `betas` (2,) or (batch, 2) lengthen and widen."""
     random = torch.Generator().manual_seed(3)
     joints = torch.tensor(
@@ -29,16 +34,17 @@ def make_model(*, rigid: bool = False, blended: bool = True, betas: Tensor | Non
     weights = torch.zeros(len(rest), count, **_KIND)
     owner = torch.arange(count).repeat_interleave(_AROUND)
     weights[torch.arange(len(rest)), owner] = 1
-    if not rigid:
-        share = 0.5 * torch.rand(len(rest), generator=random, **_KIND)
-        above = torch.tensor(PARENTS).clamp_min(0)[owner]
-        weights[torch.arange(len(rest)), owner] -= share
-        weights[torch.arange(len(rest)), above] += share
+    share = 0.5 * torch.rand(len(rest), generator=random, **_KIND)
+    above = torch.tensor(PARENTS).clamp_min(0)[owner]
+    weights[torch.arange(len(rest)), owner] -= share
+    weights[torch.arange(len(rest)), above] += share
     shapes = 0.01 * torch.randn(9 * count, len(rest), 3, generator=random, **_KIND)
     shapes[:9] = 0  # turning the whole body changes no shape
 
     def offsets(rotations: Tensor) -> Tensor:
         change = rotations - torch.eye(3, **_KIND)
+        if blend == "curved":
+            change = change + 0.3 * change @ change
         return torch.einsum("bm,mvc->bvc", change.flatten(1), shapes)
 
     scale = torch.ones(1, 3, **_KIND)
@@ -47,7 +53,7 @@ def make_model(*, rigid: bool = False, blended: bool = True, betas: Tensor | Non
         scale = torch.stack((1 + 0.1 * across, 1 + 0.1 * along, 1 + 0.1 * across), 1)
     return SkinnedModel(
         joint_names=tuple("abcdef"), parents=PARENTS, rest=rest * scale[:, None],
-        joints=joints * scale[:, None], weights=weights, pose_offsets=offsets if blended else None,
+        joints=joints * scale[:, None], weights=weights, pose_offsets=None if blend == "none" else offsets,
     )  # fmt: skip
 
 

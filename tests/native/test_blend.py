@@ -1,54 +1,48 @@
-"""What blend shapes add to the Gauss-Newton matrix, against derivatives of the whole model."""
+"""Pose blend shapes of a native model: what of them is linear, and the model that has them."""
 
 from __future__ import annotations
 
+import pytest
 import torch
 
 from soma_core.geometry.rotations import axis_angle_to_matrix
 from soma_core.inversion.problem import Pose
-from soma_core.native.blend import BlendMoments
+from soma_core.native.blend import blend_shapes, is_linear
 from tests.native.small_model import make_fit, make_model, make_rig, random_pose
 
-ROUNDING = 1e-6
-"""Relative to the largest entry: central differences of a smooth function in float64."""
-STEP = 1e-5
+ROUNDING = 1e-9
+"""Relative: float64."""
+DIFFERENCE = 1e-6
+"""Relative: central differences of a smooth function in float64."""
 
 
-def columns(rig, fit, pose):
-    """Derivative of the vertices by each turn in world axes and by the translation, (3 n + 3, 3 v)."""
-    turns, _ = rig.solver.walk(pose, fit.rest.offsets)
-    count = len(rig.solver.variables)
-    found = []
-    for unit in torch.eye(3 * count + 3).to(turns).view(-1, 1, count + 1, 3):
-        ends = [fit.posed(rig.solver.retract(pose, turns, sign * STEP * unit)).flatten() for sign in (1, -1)]
-        found.append((ends[0] - ends[1]) / (2 * STEP))
-    return torch.stack(found)
+@pytest.mark.parametrize(("blend", "linear"), [("linear", True), ("curved", False)])
+def test_what_is_linear_is_told_from_what_is_not(blend, linear):
+    offsets = make_model(blend=blend).pose_offsets
+    shapes = blend_shapes(offsets, 6, dtype=torch.float64, device="cpu")
+    assert is_linear(offsets, shapes) is linear
+    assert make_rig(make_model(blend=blend)).linear is linear
 
 
-def test_matrix_of_rigid_parts_is_that_of_the_derivatives():
-    model = make_model(rigid=True)
+@pytest.mark.parametrize("blend", ["none", "linear", "curved"])
+def test_error_and_slope_are_those_of_the_model(blend):
+    model = make_model(blend=blend)
     rig = make_rig(model)
     fit = make_fit(rig, model)
-    rotations, pelvis = random_pose(1)
-    eye = torch.eye(3).to(pelvis).expand(1, 1, 3, 3)
-    pose = Pose.begin(torch.cat((eye, axis_angle_to_matrix(rotations)), 1), pelvis)
-    turns, places = rig.solver.walk(pose, fit.rest.offsets)
-    blend = BlendMoments(rig.blend_shapes, rig.moments, fit.rest, fit.weights, rig.above)
-    matrix = blend.matrix(pose.relative, turns, places, rig.solver)
-    none = turns.new_zeros(1, len(rig.solver.joints), 3, 4)
-    matrix = matrix + rig.solver.normal_equations(turns, places, fit.rest.second, none)[0]
-    jacobian = columns(rig, fit, pose)
-    # The moments are of the rest mesh: arms do not reach to where blend shapes have moved the vertices.
-    offsets = model.pose_offsets(pose.relative[:, 1:])
-    owner = model.weights.argmax(1)
-    carried = (turns[:, 1:][:, owner] @ offsets[..., None]).squeeze(-1)
-    above = torch.eye(len(rig.joint_names), dtype=torch.bool)
-    for joint, parent in enumerate(model.parents):
-        above[joint] |= above[parent] if parent >= 0 else False
-    axes = torch.eye(3).to(carried)
-    for joint in range(len(rig.joint_names)):
-        moved = torch.linalg.cross(axes[:, None].expand(-1, len(owner), 3), carried.expand(3, -1, 3), dim=-1)
-        jacobian[3 * joint : 3 * joint + 3] -= (moved * above[owner, joint, None]).flatten(1)
-    expected = jacobian @ jacobian.T
-    found = matrix[0].flatten(2, 3).flatten(0, 1)
-    torch.testing.assert_close(found, expected, atol=ROUNDING * float(expected.abs().max()), rtol=0)
+    rotations, pelvis = random_pose(2)
+    turned = axis_angle_to_matrix(rotations)
+    target = rig.posed(fit.body.identity, turned.roll(1, 0), pelvis)
+    problem = fit.problem(target)
+    eye = torch.eye(3).to(pelvis).expand(2, 1, 3, 3)
+    pose = Pose.begin(torch.cat((eye, turned), 1), pelvis - problem.origin)
+
+    def error(pose):
+        there = rig.posed(fit.body.identity, pose.relative[:, 1:], pose.translation + problem.origin)
+        return (there - target).square().sum((1, 2))
+
+    view = rig.view(problem, pose)
+    torch.testing.assert_close(view.energy, error(pose), rtol=ROUNDING, atol=0)
+    step = 1e-6 * torch.randn(view.slope.shape, generator=torch.Generator().manual_seed(0)).double()
+    ends = [error(rig.solver.retract(pose, view.turns, sign * step)) for sign in (1, -1)]
+    told = 2 * (view.slope * step).sum((1, 2))
+    torch.testing.assert_close(told, (ends[0] - ends[1]) / 2, rtol=DIFFERENCE, atol=0)

@@ -36,7 +36,7 @@ def test_body_and_poses_are_found_together():
     rig, prepare, directions = small()
     betas = torch.tensor([0.8, -1.1]).double()
     turns, pelvis = random_pose(FRAMES)
-    target = rig.posed(prepare(betas).body, axis_angle_to_matrix(turns), pelvis)
+    target = rig.posed(prepare(betas).body.identity, axis_angle_to_matrix(turns), pelvis)
     found = fit_shape(prepare, directions, torch.zeros(2).double(), target, iterations=10)
     torch.testing.assert_close(found, betas, atol=EXACT, rtol=0)
 
@@ -44,7 +44,7 @@ def test_body_and_poses_are_found_together():
 def test_what_the_frames_leave_open_stays():
     rig, prepare, directions = small()
     start = torch.tensor([0.2, 0.4]).double()
-    target = rig.posed(prepare(start).body, *_still())
+    target = rig.posed(prepare(start).body.identity, *_still())
 
     def blind(betas):
         identity = directions(betas)
