@@ -1,6 +1,6 @@
-"""Descent on the error of the whole model: exact energy and slope, a matrix from moments (paper, section 3.6).
+"""Descent on the error of a whole model: exact energy and slope, a matrix from moments (paper, section 3.6).
 
-Each step evaluates the model once. The Gauss-Newton matrix of :meth:`PoseModel.matrix` is close to the true one;
+Each step evaluates the model once. The matrix of :meth:`ForwardModel.inverse` is close to the true one;
 pairs of earlier steps and changes of the slope make up for the rest (limited-memory BFGS, Nocedal and Wright,
 chapter 7, with that matrix in place of a multiple of the identity).
 """
@@ -13,9 +13,9 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from soma_core.inversion.model import PoseModel
 from soma_core.inversion.priors import JointTerms, TwistDoubt
 from soma_core.inversion.problem import Pose, Problem, View
+from soma_core.inversion.protocol import ForwardModel
 
 __all__ = ["Refinement"]
 
@@ -78,7 +78,7 @@ class Refinement:
         bound: residuals beyond it count linearly, (F,) [m]; None is least squares.
     """
 
-    def __init__(self, model: PoseModel, problem: Problem, bound: Tensor | None = None) -> None:
+    def __init__(self, model: ForwardModel, problem: Problem, bound: Tensor | None = None) -> None:
         self.model, self.problem, self.bound = model, problem, bound
         self.mass = problem.weights.sum(1).expand(len(problem.vertices))
 
