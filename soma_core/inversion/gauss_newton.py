@@ -185,11 +185,11 @@ class GaussNewton(SkinEquations):
             last_change=(energy.abs() / mass).sqrt(),
         )
 
-    def constants(self, rest: RestMoments) -> tuple[Tensor, bool]:
-        """What kernels take of identities."""
+    def constants(self, rest: RestMoments, *more: Tensor) -> tuple[Tensor, bool]:
+        """What kernels take of identities; with `more` behind it."""
         assert self.kernels is not None
         driven = () if rest.driven is None else (rest.driven.left, rest.driven.right, rest.driven.axis)
-        return self.kernels.constants(rest.second, rest.offsets, *driven)
+        return self.kernels.constants(rest.second, rest.offsets, *driven, *more)
 
     def soft(self, terms: JointTerms | None, like: Tensor) -> Soft:
         """Terms as kernels take them: by columns, which are the movable joints in descending order."""

@@ -219,7 +219,7 @@ class TwistShare:
             if doubt is not None and still is not None:
                 change = self._doubts(limb, angle, pose.relative, doubt, variables)
                 energy = (view.energy[:, None] + energy).clamp_min(0) * (1 + still[:, None] + change)
-            self.turn(relative, limb, angle[energy.argmin(1)])
+            self.turn(relative, limb, _lowest(angle, energy))
         return replace(pose, relative=relative)
 
     def free(self, held: Collection[int]) -> list[_Limb]:
@@ -311,6 +311,17 @@ class TwistShare:
         square = (moved @ limb.shapes).square().sum(-1)
         pulled = (moved @ view.pull[:, limb.ids, None]).squeeze(-1)
         return 2 * pulled + scale[:, None].square() * square
+
+
+def _lowest(angle: Tensor, energy: Tensor) -> Tensor:
+    """Angle (F,) of the least energy (F, a), between the evenly spaced `angle` (a,) by a parabola."""
+    best = energy.argmin(1, keepdim=True)
+    middle = best.clamp(1, len(angle) - 2)
+    low, here, high = (energy.gather(1, middle + step).squeeze(1) for step in (-1, 0, 1))
+    bend = low - 2 * here + high
+    shift = torch.where(bend > 0, 0.5 * (low - high) / bend.where(bend > 0, torch.ones_like(bend)), 0.0)
+    inside = torch.isfinite(shift) & (best == middle).squeeze(1)
+    return angle[best.squeeze(1)] + torch.where(inside, shift.clamp(-0.5, 0.5), 0.0) * (angle[1] - angle[0])
 
 
 def _product(first: Tensor, second: Tensor) -> Tensor:

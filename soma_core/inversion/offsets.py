@@ -21,6 +21,7 @@ from soma_core.correctives.model import Correctives
 from soma_core.geometry.rotations import skew
 from soma_core.geometry.sparse import SparseRows
 from soma_core.inversion.gauss_newton import GaussNewton
+from soma_core.inversion.moments import RestMoments
 from soma_core.inversion.problem import Activity
 from soma_core.rig.skeleton import Rig
 
@@ -49,6 +50,7 @@ class PoseOffsets(torch.nn.Module):
             that they read (P, R), their ids (P, C'), their part of W (P, C', R, S), and their modes (P, K, C').
         gram: (P K, P K) products of modes.
         torque, force: (T, 3, P K) of modes on the weighted joints' clouds, in the joints' own axes.
+        extent: (T,) root mean square arm of each cloud [m].
     """
 
     def __init__(
@@ -207,6 +209,7 @@ class PoseOffsets(torch.nn.Module):
         solver: GaussNewton,
         fold: Tensor | None,
         scale: Tensor,
+        sizes: Tensor,
     ) -> Tensor:
         """What to add to the matrix (F, n + 1, 3, n + 1, 3) of :meth:`GaussNewton.normal_equations`.
 
@@ -216,6 +219,7 @@ class PoseOffsets(torch.nn.Module):
             solver: whose variables the matrix has.
             fold: of :meth:`GaussNewton.fold`; None without driven joints.
             scale: (F,) size of the bodies; moments are those of the canonical one.
+            sizes: of :meth:`sizes`.
         """
         n, frames = len(solver.variables), len(turns)
         public = solver.public_count
@@ -227,18 +231,25 @@ class PoseOffsets(torch.nn.Module):
         spread.scatter_add_(2, index.expand(frames, -1, -1, 3), response.flatten(1, 2))
         spread = spread[:, :, solver.variables].flatten(2)  # (F, M, 3 n)
         size = scale[:, None, None]
-        left = self._pulled(turns, places, solver, fold, scale).flatten(1, 2)  # (F, 3 n + 3, M)
+        left = self._pulled(turns, places, solver, fold, sizes).flatten(1, 2)  # (F, 3 n + 3, M)
         left[:, : 3 * n] += 0.5 * size * (self.gram @ spread).mT
         half = torch.nn.functional.pad(left @ spread, (0, 3))
         return ((half + half.mT) * size).unflatten(1, (n + 1, 3)).unflatten(3, (n + 1, 3))
 
+    def sizes(self, rest: RestMoments) -> Tensor:
+        """Extent (i, T) of every joint's cloud beside that of the canonical body."""
+        own = rest.own
+        spread = own[..., :3, :3].diagonal(dim1=-2, dim2=-1).sum(-1)
+        mass = own[..., 3, 3].clamp_min(torch.finfo(own.dtype).tiny)
+        return (spread / mass).sqrt() / self.extent
+
     def _pulled(
-        self, turns: Tensor, places: Tensor, solver: GaussNewton, fold: Tensor | None, scale: Tensor
+        self, turns: Tensor, places: Tensor, solver: GaussNewton, fold: Tensor | None, sizes: Tensor
     ) -> Tensor:
         """Torque of every mode's motion about each variable, and its force, (F, n + 1, 3, M)."""
         joints, all_variables = solver.joints, solver.movable
         own = turns[:, joints]
-        torque, force = scale[:, None, None, None] * (own @ self.torque), own @ self.force
+        torque, force = sizes[..., None, None] * (own @ self.torque), own @ self.force
         torque = torque + skew(places[:, joints]) @ force
         subtree = solver.above.to(torque)
         torque, force_below = (torch.einsum("nt,ftam->fnam", subtree, one) for one in (torque, force))
@@ -322,4 +333,11 @@ def _moments(
     torque -= np.cross(centre[:, :, None], force, axis=1)
     orient = rig.t_pose_world[joints, :3, :3].copy()
     turn = orient @ rig.bind_world[joints, :3, :3].transpose(0, 2, 1)
-    return {"gram": (moved.T @ moved).toarray(), "torque": turn @ torque, "force": turn @ force}
+    arm = np.stack([(weights @ rig.bind_shape[:, a]) for a in range(3)])  # sums
+    mass = np.asarray(weights.sum(1)).ravel()
+    square = weights @ (rig.bind_shape**2).sum(1)
+    spread = square - 2 * (centre * arm.T).sum(1) + mass * (centre**2).sum(1)
+    extent = np.sqrt(spread / mass.clip(1e-12)).clip(1e-6)
+    return {
+        "gram": (moved.T @ moved).toarray(), "torque": turn @ torque, "force": turn @ force, "extent": extent,
+    }  # fmt: skip

@@ -36,7 +36,7 @@ HINGES: Mapping[str, tuple[float, float, float]] = {
 
 
 def _untwisted() -> dict[str, tuple[tuple[float, float, float], float]]:
-    along = {"ForeArm": ((1.0, 0.0, 0.0), 0.1), "Shin": ((0.0, 1.0, 0.0), 0.1)}
+    along = {"ForeArm": ((1.0, 0.0, 0.0), 0.3), "Shin": ((0.0, 1.0, 0.0), 0.3)}
     fingers = {
         f"Hand{finger}{number}": ((1.0, 0.0, 0.0), 0.05)
         for finger in ("Index", "Middle", "Ring", "Pinky")

@@ -35,6 +35,9 @@ __all__ = ["Kind", "SkinModel"]
 _RIDGE = 1e-9
 """Added to the undamped matrix, relative to its mean diagonal, as in its factorisation by kernels."""
 
+_INDEFINITE = 1e15
+"""A variance [rad^2/m^2] that no ridge lets through: the factorisation met a pivot that is not positive."""
+
 
 class Kind(TypedDict):
     """What constants are kept as."""
@@ -175,7 +178,7 @@ class SkinModel(torch.nn.Module):
         if self._steps is None:
             slope = self.solver.slopes(turns, places, problem.rest, residual)
         else:
-            constants = self.solver.constants(problem.rest)
+            constants = self._constants(problem.rest)
             slope = self._steps.slopes(constants, pose.relative, pose.translation, residual)
         if self.offsets is not None and activity is not None and found.pull is not None:
             above = turns[:, self.solver.parents[: self.solver.public_count]]
@@ -190,7 +193,7 @@ class SkinModel(torch.nn.Module):
         """World turns (F, J', 3, 3) and places (F, J', 3) of all joints, twist joints too."""
         if self._steps is None:
             return self.solver.walk(pose, rest)
-        return self._steps.walked(self.solver.constants(rest), pose.relative, pose.translation)
+        return self._steps.walked(self._constants(rest), pose.relative, pose.translation)
 
     def distances(
         self, problem: Problem, pose: Pose, *, energy_only: bool = False
@@ -237,20 +240,34 @@ class SkinModel(torch.nn.Module):
     def angle_variance(self, problem: Problem, pose: Pose) -> Tensor:
         """Mean square angle (F, n) [rad^2] of each variable's own turn under vertex noise of variance 1 m^2.
 
-        Traces of the 3 x 3 diagonal blocks of the inverse of the undamped matrix, terms included.
+        Traces of the 3 x 3 diagonal blocks of the inverse of the undamped matrix, terms included. Modes of
+        offsets are known for equal weights: where vertices that they need are left out, skin alone counts.
         """
-        activity = None if self.offsets is None else self.offsets.activity(pose.relative)
-        none = torch.zeros_like(pose.translation[:, 0])
-        mass = problem.weights.sum(1).expand(len(none))
+        typical = problem.weights.sum(1) / max(int(self.fitted.sum()), 1)
+        second = problem.rest.second / typical[:, None, None, None]
+        problem = replace(problem, rest=replace(problem.rest, second=second))
+        mass = (problem.weights.sum(1) / typical).expand(len(pose.translation))
+        if self.offsets is None:
+            return self._variance(problem, pose, None, mass) / typical[:, None]
+        activity = self.offsets.activity(pose.relative)
+        found = self._variance(problem, pose, activity, mass)
+        if not bool(found.isfinite().all()):
+            still = replace(activity, slope=torch.zeros_like(activity.value))
+            found = torch.where(found.isfinite(), found, self._variance(problem, pose, still, mass))
+        return found / typical[:, None]
+
+    def _variance(self, problem: Problem, pose: Pose, activity: Activity | None, mass: Tensor) -> Tensor:
+        """The same for weights of one on average; NaN for frames whose matrix is not positive definite."""
         if self._steps is not None:
-            return self._steps.variances(self._factor(problem, pose, activity, none, mass))
+            found = self._steps.variances(self._factor(problem, pose, activity, torch.zeros_like(mass), mass))
+            return found.where(found.amax(1, keepdim=True) < _INDEFINITE, torch.nan)
         dense = self._with_terms(problem, pose, *self.walk(pose, problem.rest), activity, mass)
         dense = dense.flatten(3, 4).flatten(1, 2)
         diagonal = dense.diagonal(dim1=-2, dim2=-1)
         diagonal += _RIDGE * diagonal.mean(1, keepdim=True)
-        factor, _ = torch.linalg.cholesky_ex(dense)
+        factor, failed = torch.linalg.cholesky_ex(dense)
         own = torch.cholesky_inverse(factor).diagonal(dim1=-2, dim2=-1)
-        return own.unflatten(1, (-1, 3)).sum(-1)[:, :-1]
+        return own.unflatten(1, (-1, 3)).sum(-1)[:, :-1].masked_fill((failed > 0)[:, None], torch.nan)
 
     def _factor(
         self, problem: Problem, pose: Pose, activity: Activity | None, damping: Tensor, mass: Tensor
@@ -262,9 +279,13 @@ class SkinModel(torch.nn.Module):
             slope = torch.ones_like(activity.value) if activity.slope is None else activity.slope
             scale = self.scale(problem).expand(len(mass))
         return self._steps.factorise(
-            self.solver.constants(problem.rest), pose.relative, pose.translation, damping, mass, slope, scale,
+            self._constants(problem.rest), pose.relative, pose.translation, damping, mass, slope, scale,
             stiffness=HINGE_STIFFNESS, soft=self.solver.soft(problem.terms, pose.translation),
         )  # fmt: skip
+
+    def _constants(self, rest: RestMoments) -> tuple[Tensor, bool]:
+        """What kernels take of identities."""
+        return self.solver.constants(rest, *(() if self.offsets is None else (self.offsets.sizes(rest),)))
 
     def _with_terms(
         self,
@@ -298,7 +319,10 @@ class SkinModel(torch.nn.Module):
             return matrix
         fold = None if self.driven is None else self.solver.fold(turns, problem.rest)
         scale = self.scale(problem).expand(len(turns))
-        return matrix + self.offsets.matrix(activity, pose.relative, turns, places, self.solver, fold, scale)
+        sizes = self.offsets.sizes(problem.rest)
+        return matrix + self.offsets.matrix(
+            activity, pose.relative, turns, places, self.solver, fold, scale, sizes
+        )
 
     def scale(self, problem: Problem) -> Tensor:
         """Size of the bodies beside the canonical one, (1 or F,)."""

@@ -283,6 +283,7 @@ class _Modes:
         return {
             "tree_start": _starts(trees), "tree_joint": _flat(trees, 0), "tree_up": _flat(trees, 1),
             "tree_row": _flat(trees, 2), "cloud_start": _starts(clouds), "cloud_tree": _flat(clouds, 0),
+            "cloud_weighted": np.array([t for one in self.clouds for t in one]),
         }  # fmt: skip
 
     def _read_lists(

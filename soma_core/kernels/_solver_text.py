@@ -28,6 +28,7 @@ def prelude(
     lines.append("const C* second = K; const C* offsets = K + 16 * pair_count;")
     lines.append("const C* lefts = offsets + 3 * all_count; const C* rights = lefts + 9 * channel_count;")
     lines.append("const C* axes = rights + 9 * channel_count;")
+    lines.append("const C* sizes = axes + 3 * channel_count;")
     lines.append("const V zero = V{}; const V one = zero + R(1);")
     return "\n".join(lines) + "\n"
 
@@ -330,10 +331,11 @@ MODES = _PLACED + """
         for (int i = 0; i < 3 * size_p * (rows + 1); i++) y[i] = zero;
         for (int e = cloud_start[p]; e < cloud_start[p+1]; e++) {
             int node = cloud_tree[e]; const V* d = turns + 9 * tree_joint[first + node];
+            C arm = sizes[cloud_weighted[e]];
             for (int m = 0; m < size_p; m++, moment += 6) {
                 V* x = tree + 6 * (size_p * node + m);
                 for (int r = 0; r < 3; r++) {
-                    x[r] += size * (d[3*r] * moment[0] + d[3*r+1] * moment[1] + d[3*r+2] * moment[2]);
+                    x[r] += arm * (d[3*r] * moment[0] + d[3*r+1] * moment[1] + d[3*r+2] * moment[2]);
                     x[3+r] += d[3*r] * moment[3] + d[3*r+1] * moment[4] + d[3*r+2] * moment[5];
                 }
             }

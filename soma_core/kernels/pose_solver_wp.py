@@ -37,7 +37,7 @@ _LISTS = (
     "cross_start", "cross_row", "cross_slot", "add_slot", "add_pair", "add_channel", "twist_slot", "twist_channel",
     "twist_block", "twist_kind", "chain_channel", "chain_column",
     "mode_size", "taken_start", "taken", "read_start", "read_used", "read_column", "response_start", "tree_start",
-    "tree_joint", "tree_up", "tree_row", "cloud_start", "cloud_tree", "fold_start", "fold_tree", "fold_helper",
+    "tree_joint", "tree_up", "tree_row", "cloud_start", "cloud_tree", "cloud_weighted", "fold_start", "fold_tree", "fold_helper",
     "fold_channel", "fold_row", "mode_row_count", "apply_start", "apply_row", "apply_read", "apply_block",
     "apply_kind", "near_start_mode", "near_block", "near_rows", "used_joint",
 )  # fmt: skip
