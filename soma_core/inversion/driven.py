@@ -1,11 +1,11 @@
 """Twist joints as joints of the fit whose turn is a known function of the pose (paper, section 3.5.1).
 
-A helper hangs on its start joint and has one degree of freedom, its spin about the bone: a fixed sum of twist
-angles, each read between two joints that a pose controls. So its place and turn follow from the pose, and so
-does their derivative: a world-frame spin of a channel's joint turns the helper by
-``m a (g . spin)``, with a the helper's axis and ``g`` the gradient of the twist angle. Everything that holds
-for a tree of free joints then holds for the pose alone, once the helpers' columns are folded onto those of the
-joints that drive them.
+A helper hangs on its start joint and has one degree of freedom, its spin about the bone: a fixed sum of
+twist angles, each read between two joints that a pose controls. So its place and turn follow from the pose,
+and so does their derivative: a world-frame spin of a channel's joint turns the helper by ``m a (g . spin)``,
+with a the helper's axis and ``g`` the gradient of the twist angle. Everything that holds for a tree of free
+joints then holds for the pose alone, once the helpers' columns are folded onto those of the joints that drive
+them.
 """
 
 from __future__ import annotations
@@ -90,7 +90,8 @@ class DrivenJoints(torch.nn.Module):
         orient[0] = np.eye(3)
         axes = np.einsum("hab,hb->ha", orient[exact.start.numpy()], exact.axis.numpy())
         chain = np.zeros((len(exact.joint), rig.joint_count))
-        for row, (joint, reference) in enumerate(zip(exact.joint.tolist(), exact.reference.tolist(), strict=True)):
+        ends = zip(exact.joint.tolist(), exact.reference.tolist(), strict=True)
+        for row, (joint, reference) in enumerate(ends):
             step = joint
             while step != reference and step > 0:
                 chain[row, step] = 1
@@ -130,7 +131,8 @@ class DrivenJoints(torch.nn.Module):
         aligned = self.twist.counts[0]
         fixed = self.orient.expand(len(bind_world), -1, 3, 3)
         read = [
-            torch.cat((turn[:, of[:aligned]], fixed[:, of[aligned:]]), 1) for of in (self.reference, self.joint)
+            torch.cat((turn[:, of[:aligned]], fixed[:, of[aligned:]]), 1)
+            for of in (self.reference, self.joint)
         ]
         axis = self.twist.source_axis.expand(len(bind_world), -1, 3)
         if aligned:
@@ -139,7 +141,7 @@ class DrivenJoints(torch.nn.Module):
         return DrivenRest(left=read[0], right=read[1], axis=axis)
 
     def read(self, turns: Tensor, rest: DrivenRest) -> tuple[Tensor, Tensor]:
-        """Twist angles (F, K) [rad], and their gradients (F, K, 3) by the spin of `joint` against `reference`.
+        """Twist angles (F, K) [rad], and gradients (F, K, 3) by the spin of `joint` against `reference`.
 
         Args:
             turns: world turns (F, J or more, 3, 3) from the T-pose.
@@ -155,7 +157,7 @@ class DrivenJoints(torch.nn.Module):
         return angle, (reference @ (rest.left @ slope[..., None])).squeeze(-1)
 
     def spins(self, turns: Tensor, rest: DrivenRest) -> tuple[Tensor, Tensor]:
-        """Rotations (F, H, 3, 3) of the helpers against their start joints, and gradients as in :meth:`read`."""
+        """Rotations (F, H, 3, 3) of the helpers against their start joints; gradients of :meth:`read`."""
         angle, slope = self.read(turns, rest)
         return axis_angle_to_matrix((angle @ self.mix.mT)[..., None] * self.spin_axis), slope
 
@@ -171,7 +173,7 @@ class DrivenJoints(torch.nn.Module):
     def _euler(self, seen: Tensor) -> tuple[Tensor, Tensor]:
         """Euler channels (F, k) of rotations (F, k, 3, 3), and their gradients by a spin on the left."""
         tiny = torch.finfo(seen.dtype).eps ** 2
-        (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = (row.unbind(-1) for row in seen.unbind(-2))
+        (xx, xy, _), (yx, yy, yz), (zx, zy, zz) = (row.unbind(-1) for row in seen.unbind(-2))
         across = (xx * xx + xy * xy).clamp_min(tiny)
         down = (yy * yy + zy * zy).clamp_min(tiny)
         one, none = torch.ones_like(xx), torch.zeros_like(xx)
@@ -179,18 +181,18 @@ class DrivenJoints(torch.nn.Module):
         about_y = torch.stack((none, zz, -yz), -1) / across.sqrt()[..., None]
         about_z = torch.stack((none, (xy * zx - xx * zy), (xx * yy - xy * yx)), -1) / across[..., None]
         slopes = torch.stack((about_x, about_y, about_z), -2)
-        chosen = self.twist.euler_axis.expand(slopes.shape[:-2])[..., None, None].expand(*slopes.shape[:-2], 1, 3)
-        slope = slopes.gather(-2, chosen).squeeze(-2)
+        chosen = self.twist.euler_axis.expand(slopes.shape[:-2])[..., None, None]
+        slope = torch.take_along_dim(slopes, chosen, -2).squeeze(-2)
         return self.twist._euler(seen), self.twist.euler_sign[..., None] * slope
 
 
 def half_angle(rotation: Tensor, axis: Tensor) -> tuple[Tensor, Tensor]:
-    """Twist ``4 atan2(q_v . e, 1 + q_w)`` of rotations about unit axes, and its gradient by a spin on the left."""
+    """Twist ``4 atan2(q_v . e, 1 + q_w)`` about unit axes, and its gradient by a spin on the left."""
     quaternion = matrix_to_quaternion(rotation)
     real, vector = quaternion[..., :1], quaternion[..., 1:]
     along = (vector * axis).sum(-1, keepdim=True)
     more = 1 + real
     slope = more * (real * axis + torch.linalg.cross(vector, axis.expand_as(vector), dim=-1)) + along * vector
-    # Not atan2: PyTorch 2.13 rounds it by where an entry lies in a tensor, and frames would touch one another.
+    # Not atan2: PyTorch 2.13 rounds it by where an entry lies in a tensor, so that frames would touch.
     angle = 4 * torch.atan(along / more).squeeze(-1)
     return angle, 2 * slope / (more * more + along * along)

@@ -79,7 +79,9 @@ def elimination_plan(
     reach = {u: np.flatnonzero(above[:, [t for t, _, _ in near[u]]].any(1))[::-1] for u in columns}
     last = [int(u if k >= driven else structure.parents[u]) for k, u in enumerate(columns)]
     filled, pattern = _fill(structure, columns, reach, last, driven, coupled)
-    block_rows = [k + np.flatnonzero((filled if k >= driven else pattern)[k:, k]) for k in range(len(columns))]
+    block_rows = [
+        k + np.flatnonzero((filled if k >= driven else pattern)[k:, k]) for k in range(len(columns))
+    ]
     start = _starts(block_rows)
     slot = {(int(r), k): start[k] + i for k, rows in enumerate(block_rows) for i, r in enumerate(rows)}
     row_slots = [

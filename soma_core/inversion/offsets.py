@@ -4,10 +4,10 @@ Offsets are ``sum_c a_c(pose) V_c`` with constant shapes V. Pose correctives and
 form; they differ in how activations follow from the rotations: ``a = tanh(relu(W f))`` or ``a = f`` with f a
 linear function of every joint's local rotation.
 
-The derivative of the error is exact. Its Gauss-Newton matrix needs ``J_b^T J_b`` and ``J_s^T J_b``, where J_b is
-the motion by offsets and J_s that by skinning. Both are read from moments that are made once: shapes of one
-joint's activations are replaced by their largest modes, and vertices move as if each influence were rigid. What
-that leaves out only changes the path to the minimum.
+The derivative of the error is exact. Its Gauss-Newton matrix needs ``J_b^T J_b`` and ``J_s^T J_b``, where J_b
+is the motion by offsets and J_s that by skinning. Both are read from moments that are made once: shapes of
+one joint's activations are replaced by their largest modes, and vertices move as if each influence were
+rigid. What that leaves out only changes the path to the minimum.
 """
 
 from __future__ import annotations
@@ -46,8 +46,8 @@ class PoseOffsets(torch.nn.Module):
         fitted: (v,) vertices that count.
 
     Attributes:
-        owners, reads, taken, gate, modes: blocks of the activations of one joint: their joint (P,), the joints
-            that they read (P, R), their ids (P, C'), their part of W (P, C', R, S), and their modes (P, K, C').
+        reads, taken, gate, modes: blocks of the activations of one joint: the joints that they read (P, R),
+            their ids (P, C'), their part of W (P, C', R, S), and their modes (P, K, C').
         gram: (P K, P K) products of modes.
         torque, force: (T, 3, P K) of modes on the weighted joints' clouds, in the joints' own axes.
         extent: (T,) root mean square arm of each cloud [m].
@@ -285,7 +285,7 @@ def _blocks(
         taken[row, : len(part)], read[row, : len(found)] = part, found
         columns = (width * found[:, None] + np.arange(width)).ravel()
         gate[row, : len(part), : len(found)] = first[part][:, columns].toarray().reshape(len(part), -1, width)
-    return {"owners": owners, "taken": taken, "reads": read, "gate": gate}
+    return {"taken": taken, "reads": read, "gate": gate}
 
 
 def _modes(
@@ -321,9 +321,13 @@ def _moments(
 ) -> dict[str, np.ndarray]:
     """Products of modes, and their torque about and force on each weighted joint, in the joint's own axes."""
     planes = [scipy.sparse.csr_array(moved[axis::3]) for axis in range(3)]
-    weights = scipy.sparse.csr_array(rig.weights.tocsc()[:, joints].T @ scipy.sparse.diags_array(fitted * 1.0))
+    weights = scipy.sparse.csr_array(
+        rig.weights.tocsc()[:, joints].T @ scipy.sparse.diags_array(fitted * 1.0)
+    )
     force = np.stack([(weights @ plane).toarray() for plane in planes], 1)  # (T, 3, M)
-    arms = [scipy.sparse.csr_array(weights @ scipy.sparse.diags_array(rig.bind_shape[:, a])) for a in range(3)]
+    arms = [
+        scipy.sparse.csr_array(weights @ scipy.sparse.diags_array(rig.bind_shape[:, a])) for a in range(3)
+    ]
 
     def moment(arm: int, plane: int) -> np.ndarray:
         return (arms[arm] @ planes[plane]).toarray()

@@ -263,7 +263,7 @@ class _Modes:
         most = max(blocks, key=lambda p: size[p] * len(self.trees[p]))
         self.counts = {
             "block_count": len(blocks), "feature_columns": offsets.columns, "used_count": len(used),
-            "activation_count": activations, "feature_joints": len(offsets.left),
+            "activation_count": activations,
             "response_size": int(lists["response_start"][-1]),
             "mode_rows": max(s * 3 * (len(r) + 1) for s, r in zip(size, self.rows, strict=True)),
             "mode_tree": size[most] * 6 * len(self.trees[most]),
