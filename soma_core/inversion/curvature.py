@@ -2,8 +2,8 @@
 
 A vertex is ``y = A(T) (rest + s V a) + c(T)``: transforms T and activations a follow from the pose, and the
 error is a polynomial in both. Its second derivative along a motion u is that of the polynomial along
-``(T', a')``, which differences give without error, plus that of the path that T and a take, weighted by the slope
-in them.
+``(T', a')``, which differences give without error, plus that of the path that T and a take, weighted by the
+slope in them.
 """
 
 from __future__ import annotations
@@ -33,8 +33,8 @@ _STENCILS = {
     1: ((1.0, 1 / 2), (-1.0, -1 / 2)),
     2: ((1.0, 8 / 12), (-1.0, -8 / 12), (2.0, -1 / 12), (-2.0, 1 / 12)),
 }
-"""Steps and factors whose sum is the derivative of forces: a polynomial of degree one in transforms alone, of degree
-three in both."""
+"""Steps and factors whose sum is the derivative of forces: a polynomial of degree one in transforms alone, of
+degree three in both."""
 
 _FRAMES = 8
 """Frames whose vertices are posed at a time."""

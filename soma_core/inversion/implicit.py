@@ -22,19 +22,19 @@ _ROUNDS, _ACCURATE = 200, 1e-8
 """Largest number of products with the curvature; a frame is done when this share of its slope is left."""
 
 _RIDGE = 1e-13
-"""What a turn by one radian costs, as the square of an error of every vertex [m]: gradients of what the target
-does not determine stay finite."""
+"""What a turn by one radian costs, as the square of an error of every vertex [m]: gradients of what the
+target does not determine stay finite."""
 
 _DAMPING = 1e-6
 """Of the moments' matrix, relative to its diagonal."""
 
 _STEPS, _FINE, _LONGEST = 3, 1e-9, 0.05
-"""Newton steps from the fit to the minimum, how near that is as a root mean square over the vertices [m], and how
-far a step may go [rad, m]."""
+"""Newton steps from the fit to the minimum, how near that is as a root mean square over the vertices [m], and
+how far a step may go [rad, m]."""
 
 _EXACT, _FOLDED, _INDEFINITE = 0, 1, 2
 _TROUBLE = {
-    _FOLDED: "got the gradient of one side: they rest in a fold of the model, such as where a corrective sets in",
+    _FOLDED: "got the gradient of one side: they rest in a fold of the model, where a corrective sets in",
     _INDEFINITE: "got no gradient: their error curves downwards where they rest, which is no minimum",
 }
 
@@ -52,12 +52,12 @@ def attach_gradient(
 
     At a minimum the slope ``g(pose, x) = J^T O (y - x)``, priors included, is zero, hence
     ``d pose = H^-1 J^T O dx`` with the exact second derivative H of half the error: J^T O J, the curvature
-    that the residual adds, and that of the priors. The system is solved in float64 by conjugate gradients with
-    the moments' matrix as preconditioner, at the minimum next to the fit.
+    that the residual adds, and that of the priors. The system is solved in float64 by conjugate gradients
+    with the moments' matrix as preconditioner, at the minimum next to the fit.
 
-    Frames that are not valid get no gradient. Frames whose error curves downwards, which are not at a minimum,
-    get none either, and frames that rest in a fold of the model that of one side: a ``RuntimeWarning`` in the
-    backward pass counts and names both. Exact targets have neither.
+    Frames that are not valid get no gradient. Frames whose error curves downwards, which are not at a
+    minimum, get none either, and frames that rest in a fold of the model that of one side: a
+    ``RuntimeWarning`` in the backward pass counts and names both. Exact targets have neither.
 
     Args:
         vertices: targets (F, v, 3) [m] that the fit was made for.
@@ -112,7 +112,7 @@ def _pull_back(
 
 
 def _slope(system: _System, by_rotations: Tensor, by_translation: Tensor) -> Tensor:
-    """Derivative (F, n + 1, 3) by turns in world axes, and by the translation, from that by matrix entries."""
+    """Derivative (F, n + 1, 3) by turns in world axes and by the translation, from that by matrix entries."""
     solver = system.model.solver
     n = solver.variables
     product = system.pose.relative[:, n] @ by_rotations[:, n - 1].mT
@@ -215,7 +215,7 @@ class _System:
         return torch.cat((torch.where(hinge, along, motion[:, :-1]), motion[:, -1:]), 1)
 
     def solve(self, slope: Tensor) -> tuple[Tensor, Tensor]:
-        """Motions (F, n + 1, 3) that the matrix maps to slopes, and (F,) whether it is positive on the way."""
+        """Motions (F, n + 1, 3) that the matrix maps to slopes, and (F,) whether it is positive there."""
         left = self.free(slope)
         motion, good = torch.zeros_like(left), torch.ones(len(left), dtype=torch.bool, device=left.device)
         way = near = self.free(self.inverse(left))

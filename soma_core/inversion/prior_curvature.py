@@ -1,11 +1,14 @@
 """What priors add to the error of a pose, to second order.
 
-A fit lowers ``(E + t) (1 + S)``: the error E of the vertices, terms t of single joints, and the doubt S of their
-twists. Over ``1 + S``, half its second derivative is ``H + 2 (g s^T + s g^T) + e S''``, with H and g those of
-``E + t``, ``s`` half the slope of S over ``1 + S``, ``e = (E + t) / (1 + S)`` and S'' half the second derivative of S.
+A fit lowers ``(E + t) (1 + S)``: the error E of the vertices, terms t of single joints, and the doubt S of
+their twists. Over ``1 + S``, half its second derivative is ``H + 2 (g s^T + s g^T) + e S''``, with H and g
+those of ``E + t``, ``s`` half the slope of S over ``1 + S``, ``e = (E + t) / (1 + S)``, and S'' half the
+second derivative of S.
 """
 
 from __future__ import annotations
+
+from dataclasses import replace
 
 import torch
 from torch import Tensor
@@ -65,7 +68,7 @@ class Priors:
         return bent + both + doubt.energy[:, None, None] * doubt.times(motion)
 
     def pulled(self, motion: Tensor) -> Tensor:
-        """Minus half the derivative (F, v, 3) of ``slope . motion`` by the target, vertex weights left out."""
+        """Minus the derivative (F, v, 3) of ``slope . motion`` by the target, vertex weights left out."""
         moved = self._curvature.moved(motion)
         if self._doubt is None:
             return moved
@@ -88,7 +91,7 @@ class _Doubt:
             count = len(solver.variables)
             self._motion = torch.zeros_like(turns[:, : count + 1, 0]).requires_grad_()
             near = solver.retract(pose, turns, self._motion).relative[:, solver.variables]
-            exact = TwistDoubt(variable=doubt.variable, axis=doubt.axis.double(), square=doubt.square.double())
+            exact = replace(doubt, axis=doubt.axis.double(), square=doubt.square.double())
             share = exact.share(near)
             (self._half,) = torch.autograd.grad(0.5 * share.sum(), self._motion, create_graph=True)
         more = 1 + share.detach()
@@ -123,13 +126,8 @@ def term_blocks(terms: JointTerms, rotations: Tensor, above: Tensor) -> Tensor:
 
 
 def _terms_in_float64(terms: JointTerms) -> JointTerms:
-    return JointTerms(
-        variable=terms.variable,
-        stiffness=terms.stiffness.double(),
-        free=terms.free.double(),
-        reference=terms.reference.double(),
-        hinge_axis=terms.hinge_axis.double(),
-    )
+    names = "stiffness", "free", "reference", "hinge_axis"
+    return replace(terms, **{name: getattr(terms, name).double() for name in names})
 
 
 def _padded(turns: Tensor) -> Tensor:

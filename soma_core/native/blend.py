@@ -1,4 +1,4 @@
-"""Pose blend shapes of a native model: measured where they are linear, differentiated by autograd where not."""
+"""Pose blend shapes of a native model: measured where linear, differentiated by autograd where not."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _BATCH = 64
 """Blend shapes evaluated at a time."""
 
 _ROUNDING = 64
-"""Multiples of the dtype's rounding, relative to the largest offset, that linear blend shapes may be off by."""
+"""Multiples of the dtype's rounding, relative to the largest offset, that linear shapes may be off by."""
 
 _STEP = 1e-4
 """Largest turn [rad] and shift [m] of a central difference along one direction, in float64."""
@@ -43,7 +43,7 @@ def blend_shapes(
 
 
 def is_linear(offsets: Callable[[Tensor], Tensor], shapes: Tensor) -> bool:
-    """Whether offsets are blend shapes (9 J, n, 3) times the change of the rotations, at poses far from rest."""
+    """Whether offsets are shapes (9 J, n, 3) times the change of the rotations, at poses far from rest."""
     count = len(shapes) // 9
     angles = torch.linspace(-2.5, 2.5, 6 * count).to(shapes).view(2, count, 3)
     turned = axis_angle_to_matrix(torch.cat((0 * angles[:1], angles)))

@@ -40,9 +40,9 @@ class NativeFit:
     """Recovers the pose parameters of a native model from posed SOMA bodies; keeps no state between calls.
 
     Canonical vertices go to the native topology, and the model's own pose is fitted to them: aligned
-    joint by joint, then by Levenberg-Marquardt on the moments of its skinning, then by descent on the error of
-    the whole model with its pose blend shapes. Frames are fitted in batches, every joint of the model at once, hands
-    included.
+    joint by joint, then by Levenberg-Marquardt on the moments of its skinning, then by descent on the error
+    of the whole model with its pose blend shapes. Frames are fitted in batches, every joint of the model at
+    once, hands included.
 
     Args:
         backend: name of an installed backend whose generator tells its skinning (the SMPL family).

@@ -131,7 +131,12 @@ class NativeRig(SkinModel):
         rest = self.rest(identity, weights[None]) if rest is None else rest
         moments, origin = self.moments.target(target, rest)
         return Problem(
-            vertices=target, weights=weights[None], identity=identity, rest=rest, target=moments, origin=origin
+            vertices=target,
+            weights=weights[None],
+            identity=identity,
+            rest=rest,
+            target=moments,
+            origin=origin,
         )
 
     def view(self, problem: Problem, pose: Pose, bound: Tensor | None = None) -> View:
