@@ -39,6 +39,10 @@ _CHUNK = 512
 _SCALES = (0.2, 5.0)
 """A body this much smaller or larger than its identity is in another unit, or no body."""
 
+_RESTING_SHARE = 0.015
+"""A frame has converged under the full model when a Newton step would change it by less than this share of the
+error that is left: where correctives have a fold, the slope never vanishes."""
+
 _COLLAPSED = 0.1
 """A joint whose cloud has less than this share of its extent left cannot be determined."""
 
@@ -294,7 +298,8 @@ class PoseInversion(torch.nn.Module):
         if vertices is not frames.vertices:
             error.masked_fill_(~torch.isfinite(frames.vertices).all(-1), torch.nan)
         determined = self._determined(extent > _COLLAPSED) & usable[:, None]
-        resting = 0.0 if self.ladder.whole is not None else self.ladder.options.tolerance
+        residual = (energy / mass).sqrt()
+        resting = self.ladder.options.tolerance if self.ladder.whole is None else _RESTING_SHARE * residual
         return InversionResult(
             rotations=relative[:, 1:],
             translation=translation,
@@ -303,7 +308,7 @@ class PoseInversion(torch.nn.Module):
             determined=determined,
             converged=((pose.last_change < resting) | (pose.last_change == 0)) & usable,
             iterations=pose.accepted,
-            residual=(energy / mass).sqrt().masked_fill(~usable, torch.nan),
+            residual=residual.masked_fill(~usable, torch.nan),
             angle_std=self._angle_std(problem, near, energy).masked_fill(~determined, torch.nan),
         ), scale
 

@@ -25,7 +25,7 @@ _KEPT = 8e-3
 """Strength that keeps the joint below an upper arm or a thigh while moments are fitted [m/rad]: far above what tells
 its twist, far below what tells how it bends."""
 
-_RESTING, _RESTING_SHARE = 1.5e-7, 3e-4
+_RESTING, _RESTING_SHARE = 1.5e-7, 5e-3
 """A frame rests where a Newton step would change it by less, as a root mean square of its vertices [m], or
 relative to the error that is left."""
 
@@ -35,7 +35,7 @@ _BURST = 6
 _SAMPLED = 8
 """Every so many vertices have a say in a frame's median residual."""
 
-_DOUBTFUL = (1e-6, 3e-4)
+_DOUBTFUL = (1e-6, 8e-4)
 """A root mean square error [m] between these is more than rounding and less than noise: such a frame may rest in
 a fold of the correctives beside its minimum, and is tried from further limb twists."""
 
