@@ -35,6 +35,9 @@ __all__ = ["Kind", "SkinModel"]
 _RIDGE = 1e-9
 """Added to the undamped matrix, relative to its mean diagonal, as in its factorisation by kernels."""
 
+_HELD = 1e-6
+"""Relative damping where skin alone counts, which leaves open how limbs share a twist."""
+
 _INDEFINITE = 1e15
 """A variance [rad^2/m^2] that no ridge lets through: the factorisation met a pivot that is not positive."""
 
@@ -253,18 +256,21 @@ class SkinModel(torch.nn.Module):
         found = self._variance(problem, pose, activity, mass)
         if not bool(found.isfinite().all()):
             still = replace(activity, slope=torch.zeros_like(activity.value))
-            found = torch.where(found.isfinite(), found, self._variance(problem, pose, still, mass))
+            found = torch.where(found.isfinite(), found, self._variance(problem, pose, still, mass, _HELD))
         return found / typical[:, None]
 
-    def _variance(self, problem: Problem, pose: Pose, activity: Activity | None, mass: Tensor) -> Tensor:
+    def _variance(
+        self, problem: Problem, pose: Pose, activity: Activity | None, mass: Tensor, damping: float = 0.0
+    ) -> Tensor:
         """The same for weights of one on average; NaN for frames whose matrix is not positive definite."""
         if self._steps is not None:
-            found = self._steps.variances(self._factor(problem, pose, activity, torch.zeros_like(mass), mass))
+            damped = torch.full_like(mass, damping)
+            found = self._steps.variances(self._factor(problem, pose, activity, damped, mass))
             return found.where(found.amax(1, keepdim=True) < _INDEFINITE, torch.nan)
         dense = self._with_terms(problem, pose, *self.walk(pose, problem.rest), activity, mass)
         dense = dense.flatten(3, 4).flatten(1, 2)
         diagonal = dense.diagonal(dim1=-2, dim2=-1)
-        diagonal += _RIDGE * diagonal.mean(1, keepdim=True)
+        diagonal += damping * diagonal + _RIDGE * diagonal.mean(1, keepdim=True)
         factor, failed = torch.linalg.cholesky_ex(dense)
         own = torch.cholesky_inverse(factor).diagonal(dim1=-2, dim2=-1)
         return own.unflatten(1, (-1, 3)).sum(-1)[:, :-1].masked_fill((failed > 0)[:, None], torch.nan)
