@@ -50,7 +50,7 @@ class PoseOffsets(torch.nn.Module):
             their ids (P, C'), their part of W (P, C', R, S), and their modes (P, K, C').
         gram: (P K, P K) products of modes.
         torque, force: (T, 3, P K) of modes on the weighted joints' clouds, in the joints' own axes.
-        extent: (T,) root mean square arm of each cloud [m].
+        extent, mass: (T,) root mean square arm [m] and weight of each cloud.
     """
 
     def __init__(
@@ -209,7 +209,7 @@ class PoseOffsets(torch.nn.Module):
         solver: GaussNewton,
         fold: Tensor | None,
         scale: Tensor,
-        sizes: Tensor,
+        sizes: tuple[Tensor, Tensor],
     ) -> Tensor:
         """What to add to the matrix (F, n + 1, 3, n + 1, 3) of :meth:`GaussNewton.normal_equations`.
 
@@ -232,24 +232,30 @@ class PoseOffsets(torch.nn.Module):
         spread = spread[:, :, solver.variables].flatten(2)  # (F, M, 3 n)
         size = scale[:, None, None]
         left = self._pulled(turns, places, solver, fold, sizes).flatten(1, 2)  # (F, 3 n + 3, M)
-        left[:, : 3 * n] += 0.5 * size * (self.gram @ spread).mT
+        left[:, : 3 * n] += 0.5 * size * sizes[1][:, -1:, None] * (self.gram @ spread).mT
         half = torch.nn.functional.pad(left @ spread, (0, 3))
         return ((half + half.mT) * size).unflatten(1, (n + 1, 3)).unflatten(3, (n + 1, 3))
 
-    def sizes(self, rest: RestMoments) -> Tensor:
-        """Extent (i, T) of every joint's cloud beside that of the canonical body."""
+    def sizes(self, rest: RestMoments) -> tuple[Tensor, Tensor]:
+        """How a body and its vertex weights differ from what the moments were made of, (i, T) and (i, T + 1).
+
+        Extent of every joint's cloud beside that of the canonical body; and its weight, beside that of all
+        vertices that take part by default. The last entry is the largest weight: it bounds what modes weigh.
+        """
         own = rest.own
-        spread = own[..., :3, :3].diagonal(dim1=-2, dim2=-1).sum(-1)
-        mass = own[..., 3, 3].clamp_min(torch.finfo(own.dtype).tiny)
-        return (spread / mass).sqrt() / self.extent
+        spread, mass = own[..., :3, :3].diagonal(dim1=-2, dim2=-1).sum(-1), own[..., 3, 3]
+        extent = (spread / mass.clamp_min(torch.finfo(own.dtype).tiny)).sqrt() / self.extent
+        share = mass / self.mass
+        return extent, torch.cat((share, share.amax(1, keepdim=True)), 1)
 
     def _pulled(
-        self, turns: Tensor, places: Tensor, solver: GaussNewton, fold: Tensor | None, sizes: Tensor
+        self, turns: Tensor, places: Tensor, solver: GaussNewton, fold: Tensor | None, sizes: tuple[Tensor, Tensor]
     ) -> Tensor:
         """Torque of every mode's motion about each variable, and its force, (F, n + 1, 3, M)."""
         joints, all_variables = solver.joints, solver.movable
         own = turns[:, joints]
-        torque, force = sizes[..., None, None] * (own @ self.torque), own @ self.force
+        extent, share = sizes[0][..., None, None], sizes[1][:, :-1, None, None]
+        torque, force = share * extent * (own @ self.torque), share * (own @ self.force)
         torque = torque + skew(places[:, joints]) @ force
         subtree = solver.above.to(torque)
         torque, force_below = (torch.einsum("nt,ftam->fnam", subtree, one) for one in (torque, force))
@@ -344,4 +350,5 @@ def _moments(
     extent = np.sqrt(spread / mass.clip(1e-12)).clip(1e-6)
     return {
         "gram": (moved.T @ moved).toarray(), "torque": turn @ torque, "force": turn @ force, "extent": extent,
+        "mass": mass.clip(1e-12),
     }  # fmt: skip

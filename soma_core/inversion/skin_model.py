@@ -291,7 +291,7 @@ class SkinModel(torch.nn.Module):
 
     def _constants(self, rest: RestMoments) -> tuple[Tensor, bool]:
         """What kernels take of identities."""
-        return self.solver.constants(rest, *(() if self.offsets is None else (self.offsets.sizes(rest),)))
+        return self.solver.constants(rest, *(() if self.offsets is None else self.offsets.sizes(rest)))
 
     def _with_terms(
         self,

@@ -28,7 +28,7 @@ def prelude(
     lines.append("const C* second = K; const C* offsets = K + 16 * pair_count;")
     lines.append("const C* lefts = offsets + 3 * all_count; const C* rights = lefts + 9 * channel_count;")
     lines.append("const C* axes = rights + 9 * channel_count;")
-    lines.append("const C* sizes = axes + 3 * channel_count;")
+    lines.append("const C* sizes = axes + 3 * channel_count; const C* shares = sizes + weighted_count;")
     lines.append("const V zero = V{}; const V one = zero + R(1);")
     return "\n".join(lines) + "\n"
 
@@ -284,7 +284,7 @@ FORCES = """
 """
 
 MODES = _PLACED + """
-    V size = scale[0];
+    V size = scale[0], most = size * shares[weighted_count];
     for (int i = 0; i < 9 * column_count; i++) mode_force[i] = zero;
     const int W = 3 * feature_columns;
     for (int i = 0; i < used_count; i++) {
@@ -331,12 +331,12 @@ MODES = _PLACED + """
         for (int i = 0; i < 3 * size_p * (rows + 1); i++) y[i] = zero;
         for (int e = cloud_start[p]; e < cloud_start[p+1]; e++) {
             int node = cloud_tree[e]; const V* d = turns + 9 * tree_joint[first + node];
-            C arm = sizes[cloud_weighted[e]];
+            V share = zero + shares[cloud_weighted[e]], arm = share * sizes[cloud_weighted[e]];
             for (int m = 0; m < size_p; m++, moment += 6) {
                 V* x = tree + 6 * (size_p * node + m);
                 for (int r = 0; r < 3; r++) {
                     x[r] += arm * (d[3*r] * moment[0] + d[3*r+1] * moment[1] + d[3*r+2] * moment[2]);
-                    x[3+r] += d[3*r] * moment[3] + d[3*r+1] * moment[4] + d[3*r+2] * moment[5];
+                    x[3+r] += share * (d[3*r] * moment[3] + d[3*r+1] * moment[4] + d[3*r+2] * moment[5]);
                 }
             }
         }
@@ -369,7 +369,7 @@ MODES = _PLACED + """
         for (int e = near_start_mode[p]; e < near_start_mode[p+1]; e++) {
             int b = near_block[e], size_b = mode_size[b], seen = read_start[b+1] - read_start[b];
             for (int m = 0; m < size_p; m++) for (int l = 0; l < size_b; l++) {
-                V h = (R(0.5) * grams[m*size_b+l]) * size; const V* x = response + response_start[b] + 3*l*seen;
+                V h = (R(0.5) * grams[m*size_b+l]) * most; const V* x = response + response_start[b] + 3*l*seen;
                 for (int r = 0; r < seen; r++) {
                     V* o = y + 3 * (size_p * into[r] + m);
                     o[0] += h * x[3*r]; o[1] += h * x[3*r+1]; o[2] += h * x[3*r+2];
