@@ -211,14 +211,13 @@ class TwistShare:
             held: joints that cannot turn so; limbs with such stay as they are.
         """
         rest, doubt = problem.rest, problem.doubt
-        still = None if doubt is None else doubt.share(pose.relative[:, variables])
         relative = pose.relative.clone()
         angle = torch.linspace(-math.pi, math.pi, _SHARES).to(relative)
         for limb in self.free(held):
             energy = self._skin(limb, angle, view, rest) + self._moves(limb, angle, pose.relative, view, scale)
-            if doubt is not None and still is not None:
+            if doubt is not None:
                 change = self._doubts(limb, angle, pose.relative, doubt, variables)
-                energy = (view.energy[:, None] + energy).clamp_min(0) * (1 + still[:, None] + change)
+                energy = energy + view.energy[:, None] * change
             self.turn(relative, limb, _lowest(angle, energy))
         return replace(pose, relative=relative)
 

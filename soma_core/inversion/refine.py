@@ -76,10 +76,17 @@ class Refinement:
         model: the forward model.
         problem: targets, identity and terms.
         bound: residuals beyond it count linearly, (F,) [m]; None is least squares.
+        typical: error (F,) [m] that doubt is measured by, with `bound`; else it is what is left.
     """
 
-    def __init__(self, model: ForwardModel, problem: Problem, bound: Tensor | None = None) -> None:
-        self.model, self.problem, self.bound = model, problem, bound
+    def __init__(
+        self,
+        model: ForwardModel,
+        problem: Problem,
+        bound: Tensor | None = None,
+        typical: Tensor | None = None,
+    ) -> None:
+        self.model, self.problem, self.bound, self.typical = model, problem, bound, typical
         self.mass = problem.weights.sum(1).expand(len(problem.vertices))
 
     def __call__(self, start: Pose, *, iterations: int, tolerance: float, share: float = 0.0) -> Pose:
@@ -145,6 +152,10 @@ class Refinement:
         rotations, more = pose.relative[:, n], 1 + doubt.share(pose.relative[:, n])
         slope = view.slope.clone()
         own = doubt.slope(rotations, view.turns[:, self.model.solver.parents[n]])
+        if self.typical is not None:
+            weight = self.mass * self.typical.square()
+            slope[:, : len(n)] += weight[:, None, None] * own
+            return replace(view, slope=slope, energy=view.energy + weight * (more - 1))
         slope[:, : len(n)] += (view.energy / more)[:, None, None] * own
         return replace(view, slope=slope, energy=view.energy * more)
 
@@ -162,6 +173,8 @@ class Refinement:
             rotations = pose.relative[:, self.model.solver.variables]
             problem = replace(problem, terms=doubt.blocks(rotations))
             mass = view.energy / (1 + doubt.share(rotations)).square()
+            if self.typical is not None:
+                mass = self.mass * self.typical.square()
         return self.model.inverse(problem, pose, view, damping, mass)
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import torch
 from torch import Tensor
@@ -43,6 +43,13 @@ _TRIED = (0.2, -0.2, 0.45, -0.45)
 """Those twists, against what was found [rad]."""
 
 
+class _Clip(NamedTuple):
+    """Lengths (F,) [m]: residuals beyond `bound` count linearly; the median residual is `typical`."""
+
+    bound: Tensor
+    typical: Tensor
+
+
 class WholeFit:
     """From a pose fitted to moments of skinning to the minimum of the whole model.
 
@@ -70,40 +77,42 @@ class WholeFit:
         problem = targets.problem(self.coarse)
         steps = pose.accepted
         pose = replace(pose, translation=pose.translation - problem.origin)
-        pose, bound = self._approached(problem, pose)
-        pose = self._descended(self.coarse, problem, pose, bound)
+        pose, clip = self._approached(problem, pose)
+        pose = self._descended(self.coarse, problem, pose, clip)
         if self.options.robust is None:
             pose = self._searched(problem, pose)
         if self.coarse is not self.model:
             world = pose.translation + problem.origin
             problem = targets.problem(self.model)
             pose = replace(pose, translation=world - problem.origin)
-            if bound is not None:
-                bound = self._bound(self.model, problem, pose)
-            pose = self._descended(self.model, problem, pose, bound)
+            if clip is not None:
+                clip = self._clip(self.model, problem, pose)
+            pose = self._descended(self.model, problem, pose, clip)
         accepted = steps + pose.accepted
         return replace(pose, translation=pose.translation + problem.origin, accepted=accepted), problem
 
-    def _approached(self, problem: Problem, pose: Pose) -> tuple[Pose, Tensor | None]:
+    def _approached(self, problem: Problem, pose: Pose) -> tuple[Pose, _Clip | None]:
         """Offsets, clips and the limbs' twist are looked at in turns with steps on moments."""
         model, robust = self.coarse, self.options.robust is not None
-        rounds, bound = self.options.robust_rounds if robust else _ROUNDS, None
+        rounds, clip = self.options.robust_rounds if robust else _ROUNDS, None
         for _ in range(rounds):
             if robust:
-                bound = self._bound(model, problem, pose)
-            pose = self._shared(problem, pose, bound)
-            view = model.view(problem, pose, bound)
+                clip = self._clip(model, problem, pose)
+            pose = self._shared(problem, pose, clip)
+            view = model.view(problem, pose, None if clip is None else clip.bound)
             pose = model.solver(
                 problem.target, problem.rest, pose, iterations=_STEPS, tolerance=self.options.tolerance,
                 terms=self._kept(problem, pose), residual=view.residual,
             )  # fmt: skip
-        return replace(pose, accepted=torch.zeros_like(pose.accepted)), bound
+        return replace(pose, accepted=torch.zeros_like(pose.accepted)), clip
 
-    def _shared(self, problem: Problem, pose: Pose, bound: Tensor | None) -> Pose:
+    def _shared(self, problem: Problem, pose: Pose, clip: _Clip | None) -> Pose:
         share = self.coarse.share
         if share is None:
             return pose
-        view = self.coarse.view(problem, pose, bound)
+        view = self.coarse.view(problem, pose, None if clip is None else clip.bound)
+        if clip is not None:
+            view = replace(view, energy=problem.weights.sum(1) * clip.typical.square())
         scale = self.coarse.scale(problem).expand(len(pose.translation))
         return share(pose, view, problem, scale, self.coarse.solver.variables, self._held(problem))
 
@@ -138,16 +147,16 @@ class WholeFit:
         hinged = (problem.terms.hinge_axis != 0).any(-1)
         return frozenset(self.coarse.solver.variables[hinged].tolist())
 
-    def _bound(self, model: PoseModel, problem: Problem, pose: Pose) -> Tensor:
-        """Length (F,) [m] beyond which residuals count linearly."""
+    def _clip(self, model: PoseModel, problem: Problem, pose: Pose) -> _Clip:
+        """Where residuals begin to count linearly."""
         assert self.options.robust is not None
         distances, _ = model.distances(problem, pose)
         assert distances is not None
         counted = (problem.weights > 0).expand_as(distances)[:, ::_SAMPLED]
-        typical = distances[:, ::_SAMPLED].masked_fill(~counted, torch.nan).nanmedian(1).values
-        return (2 * typical.nan_to_num(0.0)).clamp_min(self.options.robust)
+        typical = distances[:, ::_SAMPLED].masked_fill(~counted, torch.nan).nanmedian(1).values.nan_to_num(0.0)
+        return _Clip(bound=(2 * typical).clamp_min(self.options.robust), typical=typical)
 
-    def _descended(self, model: PoseModel, problem: Problem, pose: Pose, bound: Tensor | None) -> Pose:
+    def _descended(self, model: PoseModel, problem: Problem, pose: Pose, clip: _Clip | None) -> Pose:
         """Descent on the model; frames that rest are left alone."""
         rows = torch.arange(len(pose.accepted), device=pose.accepted.device)
         pose = replace(pose, last_change=torch.full_like(pose.last_change, torch.inf))
@@ -156,7 +165,8 @@ class WholeFit:
                 break
             every = len(rows) == len(pose.accepted)
             part = problem if every else problem.part(rows)
-            refinement = Refinement(model, part, bound if bound is None or every else bound[rows])
+            clips = () if clip is None else (clip.bound[rows], clip.typical[rows])
+            refinement = Refinement(model, part, *clips)
             steps = min(_BURST, self.options.refreshes - done)
             found = refinement(
                 pose if every else pose.part(rows), iterations=steps, tolerance=_RESTING, share=_RESTING_SHARE
