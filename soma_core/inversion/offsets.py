@@ -27,6 +27,9 @@ from soma_core.rig.skeleton import Rig
 
 __all__ = ["PoseOffsets"]
 
+_FILLED = 0.1
+"""Share of entries from which shapes are no longer treated as sparse."""
+
 _LEAST_MODE = 1e-4
 """Root mean square motion of all vertices [m] below which a mode of one joint's shapes is left out."""
 
@@ -296,9 +299,9 @@ def _blocks(
 
 def _modes(
     shapes: scipy.sparse.csr_array, taken: np.ndarray, fitted: np.ndarray
-) -> tuple[np.ndarray, scipy.sparse.csr_array]:
+) -> tuple[np.ndarray, scipy.sparse.csr_array | np.ndarray]:
     """Modes (P, K, C') of each block, orthonormal, and what one unit of each moves, (3 v, P K)."""
-    counted = scipy.sparse.diags_array(np.repeat(fitted.astype(np.float64), 3)) @ shapes
+    counted = (scipy.sparse.diags_array(np.repeat(fitted.astype(np.float64), 3)) @ shapes).tocsc()
     least = _LEAST_MODE * np.sqrt(fitted.sum())
     found = []
     for row in taken:
@@ -319,24 +322,26 @@ def _modes(
         (np.concatenate(values), (np.concatenate(rows), np.concatenate(columns))),
         shape=(shapes.shape[1], len(taken) * width),
     )
-    return modes, scipy.sparse.csr_array(counted @ mixing)
+    if counted.nnz < _FILLED * np.prod(shapes.shape):
+        return modes, scipy.sparse.csr_array(counted @ mixing)
+    return modes, counted.toarray() @ mixing.toarray()
 
 
 def _moments(
-    moved: scipy.sparse.csr_array, rig: Rig, joints: np.ndarray, fitted: np.ndarray
+    moved: scipy.sparse.csr_array | np.ndarray, rig: Rig, joints: np.ndarray, fitted: np.ndarray
 ) -> dict[str, np.ndarray]:
     """Products of modes, and their torque about and force on each weighted joint, in the joint's own axes."""
-    planes = [scipy.sparse.csr_array(moved[axis::3]) for axis in range(3)]
+    planes = [moved[axis::3] for axis in range(3)]
     weights = scipy.sparse.csr_array(
         rig.weights.tocsc()[:, joints].T @ scipy.sparse.diags_array(fitted * 1.0)
     )
-    force = np.stack([(weights @ plane).toarray() for plane in planes], 1)  # (T, 3, M)
+    force = np.stack([_full(weights @ plane) for plane in planes], 1)  # (T, 3, M)
     arms = [
         scipy.sparse.csr_array(weights @ scipy.sparse.diags_array(rig.bind_shape[:, a])) for a in range(3)
     ]
 
     def moment(arm: int, plane: int) -> np.ndarray:
-        return (arms[arm] @ planes[plane]).toarray()
+        return _full(arms[arm] @ planes[plane])
 
     torque = np.stack([moment(b, c) - moment(c, b) for b, c in ((1, 2), (2, 0), (0, 1))], 1)
     centre = rig.bind_world[joints, :3, 3]
@@ -349,6 +354,10 @@ def _moments(
     spread = square - 2 * (centre * arm.T).sum(1) + mass * (centre**2).sum(1)
     extent = np.sqrt(spread / mass.clip(1e-12)).clip(1e-6)
     return {
-        "gram": (moved.T @ moved).toarray(), "torque": turn @ torque, "force": turn @ force, "extent": extent,
+        "gram": _full(moved.T @ moved), "torque": turn @ torque, "force": turn @ force, "extent": extent,
         "mass": mass.clip(1e-12),
     }  # fmt: skip
+
+
+def _full(product: scipy.sparse.csr_array | np.ndarray) -> np.ndarray:
+    return product if isinstance(product, np.ndarray) else product.toarray()
