@@ -243,12 +243,12 @@ class SkinModel(torch.nn.Module):
     def angle_variance(self, problem: Problem, pose: Pose) -> Tensor:
         """Mean square angle (F, n) [rad^2] of each variable's own turn under vertex noise of variance 1 m^2.
 
-        Traces of the 3 x 3 diagonal blocks of the inverse of the undamped matrix, terms included. Modes of
-        offsets are known for equal weights: where vertices that they need are left out, skin alone counts.
+        Traces of the 3 x 3 diagonal blocks of the inverse of the undamped matrix, terms included. Products of
+        modes are those of equal weights: where that leaves no positive definite matrix, skin alone counts.
         """
         typical = problem.weights.sum(1) / max(int(self.fitted.sum()), 1)
-        second = problem.rest.second / typical[:, None, None, None]
-        problem = replace(problem, rest=replace(problem.rest, second=second))
+        own, second = (one / typical[:, None, None, None] for one in (problem.rest.own, problem.rest.second))
+        problem = replace(problem, rest=replace(problem.rest, own=own, second=second))
         mass = (problem.weights.sum(1) / typical).expand(len(pose.translation))
         if self.offsets is None:
             return self._variance(problem, pose, None, mass) / typical[:, None]
