@@ -138,7 +138,8 @@ def test_a_pose_that_is_right_stays():
     problem = problem_of(model, identity, layer.pose(identity, rotations, HIPS).vertices)
     true = as_pose(rotations, HIPS - problem.origin)
     found = searched(model, problem, true)
-    torch.testing.assert_close(found.relative, true.relative, atol=ROUNDING, rtol=0)
+    turned = matrix_to_axis_angle(true.relative.mT @ found.relative).norm(dim=-1)
+    assert turned.max() < STEP / 4  # the least of a parabola through three shares
 
 
 def test_a_share_moves_only_its_bone_and_the_next():
