@@ -29,7 +29,7 @@ _RESTING, _RESTING_SHARE = 1.5e-7, 5e-3
 """A frame rests where a Newton step would change it by less, as a root mean square of its vertices [m], or
 relative to the error that is left."""
 
-_BURST = 6
+_BURST = 7
 """Steps after which frames that rest are left alone."""
 
 _SAMPLED = 8
@@ -39,8 +39,8 @@ _DOUBTFUL = (1e-6, 8e-4)
 """A root mean square error [m] between these is more than rounding and less than noise: such a frame may rest in
 a fold of the correctives beside its minimum, and is tried from further limb twists."""
 
-_TRIED = (0.2, -0.2, 0.45, -0.45)
-"""Those twists, against what was found [rad]."""
+_TRIED = ((0.2, -0.2), (0.45, -0.45))
+"""Those twists, against what was found [rad]: pairs, the second for what the first leaves in doubt."""
 
 
 class _Clip(NamedTuple):
@@ -95,10 +95,12 @@ class WholeFit:
         """Offsets, clips and the limbs' twist are looked at in turns with steps on moments."""
         model, robust = self.coarse, self.options.robust is not None
         rounds, clip = self.options.robust_rounds if robust else _ROUNDS, None
-        for _ in range(rounds):
+        for done in range(rounds):
             if robust:
                 clip = self._clip(model, problem, pose)
             pose = self._shared(problem, pose, clip)
+            if done == rounds - 1 and not robust:
+                break
             view = model.view(problem, pose, None if clip is None else clip.bound)
             pose = model.solver(
                 problem.target, problem.rest, pose, iterations=_STEPS, tolerance=self.options.tolerance,
@@ -160,14 +162,16 @@ class WholeFit:
         """Descent on the model; frames that rest are left alone."""
         rows = torch.arange(len(pose.accepted), device=pose.accepted.device)
         pose = replace(pose, last_change=torch.full_like(pose.last_change, torch.inf))
-        for done in range(0, self.options.refreshes, _BURST):
-            if not len(rows):
+        done = 0
+        for steps in (_BURST, self.options.refreshes - _BURST):
+            steps = min(steps, self.options.refreshes - done)
+            if not len(rows) or steps <= 0:
                 break
+            done += steps
             every = len(rows) == len(pose.accepted)
             part = problem if every else problem.part(rows)
             clips = () if clip is None else (clip.bound[rows], clip.typical[rows])
             refinement = Refinement(model, part, *clips)
-            steps = min(_BURST, self.options.refreshes - done)
             found = refinement(
                 pose if every else pose.part(rows), iterations=steps, tolerance=_RESTING, share=_RESTING_SHARE
             )
@@ -183,18 +187,21 @@ class WholeFit:
             return pose
         mass = problem.weights.sum(1).expand(len(pose.accepted))
         _, energy = self.coarse.distances(problem, pose, energy_only=True)
-        for angle in _TRIED:
-            error = (energy / mass).sqrt()
-            rows = torch.nonzero((error > _DOUBTFUL[0]) & (error < _DOUBTFUL[1])).flatten()
+        error = (energy / mass).sqrt()
+        rows = torch.nonzero((error > _DOUBTFUL[0]) & (error < _DOUBTFUL[1])).flatten()
+        for tried in _TRIED:
             if not len(rows):
                 break
-            part, old = problem.part(rows), pose.part(rows)
+            many = rows.repeat(len(tried))
+            part, old = problem.part(many), pose.part(many)
             relative = old.relative.clone()
+            angle = relative.new_tensor(tried).repeat_interleave(len(rows))
             for limb in limbs:
-                share.turn(relative, limb, relative.new_full((len(rows),), angle))
+                share.turn(relative, limb, angle)
             trial = self._descended(self.coarse, part, replace(old, relative=relative), None)
             _, reached = self.coarse.distances(part, trial, energy_only=True)
-            better = reached < 0.9 * energy[rows]
-            pose = pose.put(rows[better], trial.part(better))
-            energy = energy.index_copy(0, rows[better], reached[better])
+            least, which = reached.view(len(tried), -1).min(0)
+            better = least < 0.9 * energy[rows]
+            pose = pose.put(rows[better], trial.part((which * len(rows) + torch.arange(len(rows)).to(which))[better]))
+            rows = rows[(torch.minimum(least, energy[rows]) / mass[rows]).sqrt() > _DOUBTFUL[0]]
         return pose

@@ -7,6 +7,7 @@ operation into one SIMD instruction. On a GPU a group is one frame.
 
 import functools
 import itertools
+import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from types import SimpleNamespace
@@ -137,5 +138,10 @@ def in_threads(run: Callable[[slice], None], count: int, like: Tensor) -> None:
     if len(parts) == 1:
         run(parts[0])
         return
-    with ThreadPoolExecutor(len(parts)) as pool:
-        list(pool.map(run, parts))
+    list(_pool(os.getpid(), len(parts)).map(run, parts))
+
+
+@functools.cache
+def _pool(_process: int, size: int) -> ThreadPoolExecutor:
+    """Threads that stay between launches; a forked process has its own."""
+    return ThreadPoolExecutor(size, thread_name_prefix="soma-lanes")
