@@ -92,33 +92,22 @@ class GaussNewton(SkinEquations):
             return self._by_warp(
                 given, rest, start, iterations, tolerance, terms, forced=residual is not None
             )
-        if residual is not None:
-            turns, places = self.walk(start, rest)
-            target = self.times_second(self.transforms(turns, places), self.dense(rest.second)) - residual
-        second = self.dense(rest.second)
-        pose = start
+        pose, second = start, self.dense(rest.second)
         turns, places = self.walk(pose, rest)
-        residual = self.gradient(turns, places, second, target)
+        residual = self.gradient(turns, places, second, target) if residual is None else residual
         mass = rest.own[..., 3, 3].sum(1)
         damping = torch.full_like(pose.last_change, _START_DAMPING)
         moving = torch.ones_like(pose.last_change, dtype=torch.bool)
         for _ in range(iterations):
-            matrix, slope = self.normal_equations(turns, places, rest, residual)
-            if terms is not None:
-                self.add_terms(matrix, slope, pose.relative, turns, terms, mass)
-            step = self.damped_step(matrix, slope, damping)
-            if terms is not None:
-                step = self._along_hinges(step, turns, terms)
-            trial = self.retract(pose, turns, step)
+            system = self.normal_equations(turns, places, rest, residual)
+            trial = self.retract(pose, turns, self._step(system, pose, turns, damping, terms, mass))
             trial_turns, trial_places = self.walk(trial, rest)
             change = torch.cat((trial_turns - turns, (trial_places - places)[..., None]), -1)[:, self.joints]
             product = self.times_second(change, second)
             energy = (change * (product + 2 * residual)).sum((1, 2, 3))
             if terms is not None:
-                n = self.variables
-                energy = energy + mass * (
-                    terms.energy(trial.relative[:, n]) - terms.energy(pose.relative[:, n])
-                )
+                new, old = (terms.energy(one.relative[:, self.variables]) for one in (trial, pose))
+                energy = energy + mass * (new - old)
             better = moving & (energy < 0)
             keep = better[:, None, None, None]
             pose = Pose(
@@ -131,9 +120,24 @@ class GaussNewton(SkinEquations):
             turns = torch.where(keep, trial_turns, turns)
             places = torch.where(keep[..., 0], trial_places, places)
             residual = torch.where(keep, residual + product, residual)
-            damping = (damping * torch.where(better, _LOWER, _RAISE).to(damping)).clamp_max(_MOST_DAMPING)
-            damping = damping.clamp_min(self._least_damping)
+            damping = damping * torch.where(better, _LOWER, _RAISE).to(damping)
+            damping = damping.clamp(self._least_damping, _MOST_DAMPING)
         return pose
+
+    def _step(
+        self,
+        system: tuple[Tensor, Tensor],
+        pose: Pose,
+        turns: Tensor,
+        damping: Tensor,
+        terms: JointTerms | None,
+        mass: Tensor,
+    ) -> Tensor:
+        """Damped step (F, n + 1, 3) from normal equations, with the terms added to them."""
+        matrix, slope = system
+        if terms is not None:
+            self.add_terms(matrix, slope, pose.relative, turns, terms, mass)
+        return self.shortened(-damped_inverse(matrix, damping)(slope), turns, terms)
 
     def add_terms(
         self, matrix: Tensor, slope: Tensor, relative: Tensor, turns: Tensor, terms: JointTerms, mass: Tensor
@@ -212,16 +216,12 @@ class GaussNewton(SkinEquations):
     def _least_damping(self) -> float:
         return 0.0 if self.driven is None else _LEAST_DAMPING
 
-    def damped_step(self, matrix: Tensor, slope: Tensor, damping: Tensor) -> Tensor:
-        """Damped step (F, n + 1, 3); Cholesky only, and no error check, so nothing waits for the device."""
-        return self.shortened(-damped_inverse(matrix, damping)(slope))
-
-    def shortened(self, step: Tensor, turns: Tensor | None = None, terms: JointTerms | None = None) -> Tensor:
+    def shortened(self, step: Tensor, turns: Tensor, terms: JointTerms | None) -> Tensor:
         """The step with no joint turned too far, and hinges kept to their axis where `terms` are given."""
         length = step[:, :-1].norm(dim=-1, keepdim=True)
         short = torch.clamp(_LONGEST_STEP / length.clamp_min(1e-12), max=1)
         step = torch.cat((step[:, :-1] * short, step[:, -1:]), 1)
-        return step if terms is None or turns is None else self._along_hinges(step, turns, terms)
+        return step if terms is None else self._along_hinges(step, turns, terms)
 
     def retract(self, pose: Pose, turns: Tensor, step: Tensor) -> Pose:
         """Turn every variable joint by its step, in the axes of its parent, and remove rounding."""
@@ -234,7 +234,10 @@ class GaussNewton(SkinEquations):
 
 
 def damped_inverse(matrix: Tensor, damping: Tensor) -> Callable[[Tensor], Tensor]:
-    """Maps slopes (F, n + 1, 3) to solutions of a matrix (F, n + 1, 3, n + 1, 3) damped on its diagonal."""
+    """Maps slopes (F, n + 1, 3) to solutions of a matrix (F, n + 1, 3, n + 1, 3) damped on its diagonal.
+
+    Cholesky only, and no error check, so that nothing waits for the device.
+    """
     dense = matrix.flatten(3, 4).flatten(1, 2)
     diagonal = dense.diagonal(dim1=-2, dim2=-1)
     extra = damping[:, None] * diagonal + _RIDGE * diagonal.mean(1, keepdim=True)
