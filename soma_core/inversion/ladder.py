@@ -174,7 +174,9 @@ class Ladder(torch.nn.Module):
             near = None if pose is None else _moved(pose, -problem.origin)
             pose = _moved(getattr(self, f"_{stage}")(problem, near, model), problem.origin)
         assert pose is not None
-        if self.whole is not None and ("gauss_newton" in self.options.stages or self.options.robust is not None):
+        if self.whole is not None and (
+            "gauss_newton" in self.options.stages or self.options.robust is not None
+        ):
             return self.whole(targets, pose)
         return pose, targets.problem(self.model) if problem is None else problem
 

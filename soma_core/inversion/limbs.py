@@ -1,10 +1,10 @@
 """Upper arms and thighs: where their fit begins, and how their twist is shared with the forearm or shin.
 
-Twist joints carry all skin of an upper arm or a thigh. They undo the twist of the bone itself at its upper end
-and take on that of the next bone at its lower end. So a turn of the upper arm about its own axis, undone at
-the elbow, leaves a straight arm's skin where it is: only what correctives add tells it, by little and not by a
-parabola. The start therefore reads the twist along the bone from the clouds of the helpers, and a search looks at
-every share of it.
+Twist joints carry all skin of an upper arm or a thigh. They undo the twist of the bone itself at its upper
+end and take on that of the next bone at its lower end. So a turn of the upper arm about its own axis, undone
+at the elbow, leaves a straight arm's skin where it is: only what correctives add tells it, by little and not
+by a parabola. The start therefore reads the twist along the bone from the clouds of the helpers, and a search
+looks at every share of it.
 """
 
 from __future__ import annotations
@@ -34,8 +34,8 @@ _INNER = (0.2, 0.8)
 _MARGIN = 0.05
 """Distance kept from half a turn, where a twist angle jumps [rad]."""
 
-_CLEAR = .08
-"""Cosine of half a joint's angle that a search keeps: twists jump where it is zero, and no step leads across."""
+_CLEAR = 0.08
+"""Cosine of half a joint's angle that a search keeps: twists jump at zero, and no step leads across."""
 
 _DEAR = 5e-4
 """What it costs a share to come closer, as a root mean square error [m]."""
@@ -80,7 +80,9 @@ class LimbStart(torch.nn.Module):
         share = np.array([one + [one[-1]] * (width - len(one)) for one in shares])
         inner = counted & (share > _INNER[0]) & (share < _INNER[1])
         inner = np.where(inner.any(1, keepdims=True), inner, counted)
-        centred = np.where(counted, share - (share * counted).sum(1, keepdims=True) / counted.sum(1, keepdims=True), 0)
+        centred = np.where(
+            counted, share - (share * counted).sum(1, keepdims=True) / counted.sum(1, keepdims=True), 0
+        )
         kind = driven.mix
 
         def keep(name: str, array: np.ndarray) -> None:
@@ -214,7 +216,9 @@ class TwistShare:
         relative = pose.relative.clone()
         angle = torch.linspace(-math.pi, math.pi, _SHARES).to(relative)
         for limb in self.free(held):
-            energy = self._skin(limb, angle, view, rest) + self._moves(limb, angle, pose.relative, view, scale)
+            energy = self._skin(limb, angle, view, rest) + self._moves(
+                limb, angle, pose.relative, view, scale
+            )
             if doubt is not None:
                 change = self._doubts(limb, angle, pose.relative, doubt, variables)
                 energy = energy + view.energy[:, None] * change
@@ -226,7 +230,7 @@ class TwistShare:
         return [limb for limb in self.limbs if limb.own not in held and limb.end not in held]
 
     def turn(self, relative: Tensor, limb: _Limb, angle: Tensor) -> None:
-        """Turn a limb's bone about its axis by `angle` (F,), in place; the next joint keeps its world turn."""
+        """Turn a limb's bone about its axis by `angle` (F,), in place; the next joint's world turn stays."""
         turn = axis_angle_to_matrix(angle[:, None] * limb.axis)
         relative[:, limb.own] = relative[:, limb.own] @ turn
         relative[:, limb.end] = turn.mT @ relative[:, limb.end]
@@ -234,8 +238,8 @@ class TwistShare:
     def _skin(self, limb: _Limb, angle: Tensor, view: View, rest: RestMoments) -> Tensor:
         """Change (F, a) of the error by what the helpers do when the bone turns by each `angle` (a,).
 
-        Helpers lie on the bone, so that each turns in place by one angle, and the error is a polynomial in its
-        sine and cosine.
+        Helpers lie on the bone, so that each turns in place by one angle, and the error is a polynomial in
+        its sine and cosine.
         """
         mix = self.driven.mix[limb.helpers][:, list(limb.channels)].T
         twists, clear = self._twists(limb, torch.cat((angle, angle[:1] * 0)), view, rest)  # (F, a + 1, 2)
@@ -264,13 +268,12 @@ class TwistShare:
             return relative.new_zeros(len(relative), len(angle))
         turn = axis_angle_to_matrix(-torch.cat((angle, angle[:1] * 0))[:, None] * limb.axis)
         turned = (turn @ relative[:, limb.end, None]).flatten(0, 1)[:, None]  # (F (a + 1), 1, 3, 3)
-        one = replace(doubt, variable=which[:1] * 0, axis=doubt.axis[which[:1]], square=doubt.square[which[:1]])
+        first = which[:1]
+        one = replace(doubt, variable=first * 0, axis=doubt.axis[first], square=doubt.square[first])
         share = one.share(turned).view(len(relative), -1)
         return share[:, :-1] - share[:, -1:]
 
-    def _twists(
-        self, limb: _Limb, angle: Tensor, view: View, rest: RestMoments
-    ) -> tuple[Tensor, Tensor]:
+    def _twists(self, limb: _Limb, angle: Tensor, view: View, rest: RestMoments) -> tuple[Tensor, Tensor]:
         """Twists (F, a, 2) of the bone and of the next one when the bone turns by each `angle` (a,).
 
         Beside them, how far each joint is from half a turn, as the cosine of half its angle.
@@ -299,7 +302,9 @@ class TwistShare:
 
     def _moves(self, limb: _Limb, angle: Tensor, relative: Tensor, view: View, scale: Tensor) -> Tensor:
         """Change (F, a) of the error by what the offsets do."""
-        assert view.activity is not None and view.activity.before is not None and view.pull is not None
+        assert view.activity is not None
+        assert view.activity.before is not None
+        assert view.pull is not None
         turn = axis_angle_to_matrix(angle[:, None] * limb.axis)
         own = self.offsets.features(relative[:, limb.own, None] @ turn, limb.own)
         end = self.offsets.features(turn.mT @ relative[:, limb.end, None], limb.end)

@@ -36,9 +36,7 @@ class PoseModel(SkinModel):
         share: search of the limbs' twist; None where nothing but skinning tells it.
     """
 
-    def __init__(
-        self, layer: SomaLayer, *, plain: bool, warp: bool, some: np.ndarray | None = None
-    ) -> None:
+    def __init__(self, layer: SomaLayer, *, plain: bool, warp: bool, some: np.ndarray | None = None) -> None:
         kind: Kind = {"dtype": layer.dtype, "device": layer.device}
         fitted = np.ones(layer.mesh.vertex_count, bool)
         fitted[layer.mesh.face_interior] = False
@@ -119,6 +117,4 @@ def _rig_of(rig: Rig, some: np.ndarray) -> Rig:
     procedural = rig.procedural
     if procedural is not None:
         procedural = replace(procedural, weights=procedural.weights[some])
-    return replace(
-        rig, bind_shape=rig.bind_shape[some], weights=rig.weights[some], procedural=procedural
-    )
+    return replace(rig, bind_shape=rig.bind_shape[some], weights=rig.weights[some], procedural=procedural)

@@ -252,7 +252,12 @@ class PoseOffsets(torch.nn.Module):
         return extent, torch.cat((share, share.amax(1, keepdim=True)), 1)
 
     def _pulled(
-        self, turns: Tensor, places: Tensor, solver: GaussNewton, fold: Tensor | None, sizes: tuple[Tensor, Tensor]
+        self,
+        turns: Tensor,
+        places: Tensor,
+        solver: GaussNewton,
+        fold: Tensor | None,
+        sizes: tuple[Tensor, Tensor],
     ) -> Tensor:
         """Torque of every mode's motion about each variable, and its force, (F, n + 1, 3, M)."""
         joints, all_variables = solver.joints, solver.movable
