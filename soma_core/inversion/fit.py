@@ -194,7 +194,12 @@ class PoseInversion(torch.nn.Module):
             known, _ = _without_gaps(part.vertices, part.weights, self.layer)
             rest = part.rest.get(self.model)
             made = self.model.problem(known, part.identity, part.weights, part.bone_scale, self.terms, rest)
-            return replace(made, doubt=self.doubt)
+            if self.doubt is None:
+                return made
+            relative = torch.cat((self._still(known), result.rotations[chunk]), 1).detach()
+            view = self.model.view(made, Pose.begin(relative, result.translation[chunk].detach() - made.origin))
+            weight = self.model.clumping(view, made.weights.sum(1).expand(len(known)))
+            return replace(made, doubt=self.doubt.weighed(weight))
 
         rotations, translation = attach_gradient(
             vertices, result.rotations, result.translation, model=self.model, problem=problem,
@@ -279,7 +284,7 @@ class PoseInversion(torch.nn.Module):
         eye = torch.eye(3, dtype=vertices.dtype, device=vertices.device)
         start = None
         if frames.initial is not None:
-            relative = torch.cat((eye.expand(len(vertices), 1, 3, 3), frames.initial.rotations), 1)
+            relative = torch.cat((self._still(vertices), frames.initial.rotations), 1)
             start = Pose.begin(relative, frames.initial.translation)
         pose, problem = self.ladder(targets, start)
         rest = problem.rest
@@ -311,6 +316,11 @@ class PoseInversion(torch.nn.Module):
             residual=residual.masked_fill(~usable, torch.nan),
             angle_std=self._angle_std(problem, near, energy).masked_fill(~determined, torch.nan),
         ), scale
+
+    @staticmethod
+    def _still(vertices: Tensor) -> Tensor:
+        """Turns (F, 1, 3, 3) of the virtual root."""
+        return torch.eye(3, dtype=vertices.dtype, device=vertices.device).expand(len(vertices), 1, 3, 3)
 
     def _angle_std(self, problem: Problem, pose: Pose, energy: Tensor) -> Tensor:
         """Standard deviations (F, J - 1) [degrees] of joint angles, where the noise is what is left.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import torch
@@ -57,7 +57,7 @@ class PosePriors:
     `untwisted` decides what the vertices do not tell. A joint that is twisted by an angle a raises the error, as a
     mean square, by the share ``(doubt a)^2``: where a model meets its target, that costs nothing and changes
     nothing; where another rig's skin leaves an error, it keeps a limb from wandering after the last hundredth of
-    it. ``untwisted={}`` turns it off. Only the fit through the full model has it: plain skinning leaves no such
+    it. What is left counts as far as it is of one piece: noise of single vertices tells nothing of the model. ``untwisted={}`` turns it off. Only the fit through the full model has it: plain skinning leaves no such
     freedom.
 
     All else is off by default. A term of strength s [m/rad] that is off by an angle a costs as much as a root
@@ -146,12 +146,16 @@ class TwistDoubt:
     Attributes:
         variable: (q,) position of each joint among the variable joints.
         axis: (q, 3) unit axis in the world of the T-pose.
-        square: (q,) square of the doubt [1/rad^2].
+        square: square of the doubt [1/rad^2], (q,) or of each frame (F, q).
     """
 
     variable: Tensor
     axis: Tensor
     square: Tensor
+
+    def weighed(self, weight: Tensor) -> TwistDoubt:
+        """The doubt times a weight (F,) of each frame."""
+        return replace(self, square=weight[:, None] * self.square)
 
     def share(self, rotations: Tensor) -> Tensor:
         """``S`` (F,) of rotations (F, n, 3, 3) of the variable joints."""

@@ -51,6 +51,10 @@ class ForwardModel(Protocol):
     def view(self, problem: Problem, pose: Pose, bound: Tensor | None = None) -> View:
         """Error of poses, and its exact derivative; residuals beyond `bound` (F,) [m] count linearly."""
 
+    def clumping(self, view: View, mass: Tensor) -> Tensor:
+        """How far what is left of each frame is of one piece, (F,)."""
+        ...
+
     def inverse(
         self, problem: Problem, pose: Pose, view: View, damping: Tensor, mass: Tensor
     ) -> Callable[[Tensor], Tensor]:

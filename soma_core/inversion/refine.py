@@ -87,6 +87,8 @@ class Refinement:
         typical: Tensor | None = None,
     ) -> None:
         self.model, self.problem, self.bound, self.typical = model, problem, bound, typical
+        self.doubt: TwistDoubt | None = None
+        self.weight: Tensor | None = None
         self.mass = problem.weights.sum(1).expand(len(problem.vertices))
 
     def __call__(self, start: Pose, *, iterations: int, tolerance: float, share: float = 0.0) -> Pose:
@@ -100,7 +102,7 @@ class Refinement:
             share: or below this share of the error that is left.
         """
         solver = self.model.solver
-        pose, view = start, self._view(start)
+        pose, view = start, self._first_view(start)
         damping = torch.full_like(self.mass, _START_DAMPING)
         moving = torch.ones_like(start.accepted, dtype=torch.bool)
         shape = view.slope.shape
@@ -137,14 +139,21 @@ class Refinement:
                 solve = None
         return pose
 
-    def _view(self, pose: Pose) -> View:
-        view = self.model.view(self.problem, pose, self.bound)
-        terms, doubt = self.problem.terms, self.problem.doubt
-        if terms is not None:
-            view = self._with_terms(view, pose, terms, self.mass)
+    def _first_view(self, pose: Pose) -> View:
+        """The view of the start, which settles how much doubt of twists weighs."""
+        view, doubt = self.model.view(self.problem, pose, self.bound), self.problem.doubt
         if doubt is not None:
-            view = self._doubted(view, pose, doubt)
-        return view
+            self.weight = self.model.clumping(view, self.mass)
+            self.doubt = doubt.weighed(self.weight)
+        return self._with_priors(view, pose)
+
+    def _view(self, pose: Pose) -> View:
+        return self._with_priors(self.model.view(self.problem, pose, self.bound), pose)
+
+    def _with_priors(self, view: View, pose: Pose) -> View:
+        if self.problem.terms is not None:
+            view = self._with_terms(view, pose, self.problem.terms, self.mass)
+        return view if self.doubt is None else self._doubted(view, pose, self.doubt)
 
     def _doubted(self, view: View, pose: Pose, doubt: TwistDoubt) -> View:
         """The error E as ``E (1 + S)``, and its slope over ``1 + S``: the same direction, as long as that of E."""
@@ -168,13 +177,15 @@ class Refinement:
         return replace(view, slope=slope, energy=energy)
 
     def _inverse(self, pose: Pose, view: View, damping: Tensor) -> Callable[[Tensor], Tensor]:
-        doubt, problem, mass = self.problem.doubt, self.problem, self.mass
-        if doubt is not None and problem.terms is None:
+        problem, mass = self.problem, self.mass
+        if self.doubt is not None and self.weight is not None and problem.terms is None:
             rotations = pose.relative[:, self.model.solver.variables]
-            problem = replace(problem, terms=doubt.blocks(rotations))
-            mass = view.energy / (1 + doubt.share(rotations)).square()
+            assert problem.doubt is not None
+            problem = replace(problem, terms=problem.doubt.blocks(rotations))
+            left = view.energy / (1 + self.doubt.share(rotations)).square()
             if self.typical is not None:
-                mass = self.mass * self.typical.square()
+                left = self.mass * self.typical.square()
+            mass = self.weight * left
         return self.model.inverse(problem, pose, view, damping, mass)
 
 

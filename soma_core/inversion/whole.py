@@ -113,8 +113,9 @@ class WholeFit:
         if share is None:
             return pose
         view = self.coarse.view(problem, pose, None if clip is None else clip.bound)
-        if clip is not None:
-            view = replace(view, energy=problem.weights.sum(1) * clip.typical.square())
+        mass = problem.weights.sum(1).expand(len(view.energy))
+        weight = self.coarse.clumping(view, mass)
+        view = replace(view, energy=weight * (view.energy if clip is None else mass * clip.typical.square()))
         scale = self.coarse.scale(problem).expand(len(pose.translation))
         return share(pose, view, problem, scale, self.coarse.solver.variables, self._held(problem))
 
