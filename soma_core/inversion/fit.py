@@ -40,8 +40,8 @@ _SCALES = (0.2, 5.0)
 """A body this much smaller or larger than its identity is in another unit, or no body."""
 
 _RESTING_SHARE = 0.015
-"""A frame has converged under the full model when a Newton step would change it by less than this share of the
-error that is left: where correctives have a fold, the slope never vanishes."""
+"""A frame has converged under the full model when a Newton step would change it by less than this share of
+the error that is left: where correctives have a fold, the slope never vanishes."""
 
 _COLLAPSED = 0.1
 """A joint whose cloud has less than this share of its extent left cannot be determined."""
@@ -197,7 +197,9 @@ class PoseInversion(torch.nn.Module):
             if self.doubt is None:
                 return made
             relative = torch.cat((self._still(known), result.rotations[chunk]), 1).detach()
-            view = self.model.view(made, Pose.begin(relative, result.translation[chunk].detach() - made.origin))
+            view = self.model.view(
+                made, Pose.begin(relative, result.translation[chunk].detach() - made.origin)
+            )
             weight = self.model.clumping(view, made.weights.sum(1).expand(len(known)))
             return replace(made, doubt=self.doubt.weighed(weight))
 

