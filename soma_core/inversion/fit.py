@@ -77,12 +77,15 @@ class PoseInversion(torch.nn.Module):
     """Recovers the rig's rotations from posed vertices; keeps no state between calls.
 
     The default ladder aligns every joint's own points, then takes Levenberg-Marquardt steps on the exact
-    skinning error. The target's vertices are read once; a step costs O(joints).
+    skinning error, twist joints included. The target's vertices are read once; a step costs O(joints). Where
+    the layer has more than plain skinning, a descent on the error of the whole model follows; each of its
+    steps looks at the vertices once.
 
     Args:
         layer: makes identities, and poses them; its LOD is the LOD of the fit.
         kernels: ``torch`` (the reference), ``warp`` or ``auto``.
-        priors: joint limits, hinges, a rest pose, smooth motion.
+        priors: joint limits, hinges, a rest pose, smooth motion, joints that hardly twist; the last is on by
+            default, see :class:`PosePriors`.
         stages, iterations, tolerance, analytical, autograd, robust, robust_rounds, refreshes: see
             :class:`LadderOptions`.
 
@@ -160,8 +163,9 @@ class PoseInversion(torch.nn.Module):
             initial: an earlier result for these frames, in place of the starting stages.
 
         Returns:
-            Rotations and translation carry gradients by `vertices` (the implicit derivative of the
-            minimum: exact where the fit is, Gauss-Newton elsewhere); the report does not.
+            Rotations and translation carry gradients by `vertices` (the implicit derivative of the minimum
+            of the model that was fitted, with the exact second derivative); the report does not. A
+            ``RuntimeWarning`` in the backward pass names frames that rest in a fold of the model.
 
         Raises:
             InputError: a wrong shape, a negative weight or bone scale, or vertices in another unit than they
