@@ -136,7 +136,7 @@ class InversionChoice:
     tolerance: float = 2e-5
     robust: float | None = None
     robust_rounds: int = 10
-    refreshes: int = 6
+    refreshes: int = 30
     analytical: AnalyticalChoice = field(default_factory=AnalyticalChoice)
     autograd: AutogradChoice = field(default_factory=AutogradChoice)
     priors: PriorChoice = field(default_factory=PriorChoice)

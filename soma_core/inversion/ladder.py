@@ -165,7 +165,7 @@ class Ladder(torch.nn.Module):
         Returns:
             The pose, and the problem of the model that was fitted last.
         """
-        problem = None
+        problem, model = None, self.model
         for stage in self.options.stages:
             if pose is not None and stage in _STARTS:
                 continue
@@ -178,7 +178,9 @@ class Ladder(torch.nn.Module):
             "gauss_newton" in self.options.stages or self.options.robust is not None
         ):
             return self.whole(targets, pose)
-        return pose, targets.problem(self.model) if problem is None else problem
+        if problem is None or model is not self.model:
+            problem = targets.problem(self.model)
+        return pose, problem
 
     def _model_of(self, stage: Stage) -> PoseModel:
         return self.coarse if stage in ("procrustes", "gauss_newton") else self.skinned

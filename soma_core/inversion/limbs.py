@@ -296,7 +296,7 @@ class TwistShare:
             seen = _product(_product(left[:, None], between), right[:, None])
             seen = torch.where(seen[..., :1] < 0, -seen, seen)
             along = (seen[..., 1:] * given.axis[:, None, channel]).sum(-1)
-            twists.append(4 * torch.atan2(along, 1 + seen[..., 0]))
+            twists.append(4 * torch.atan(along / (1 + seen[..., 0])))
             cosines.append(seen[..., 0])
         return torch.stack(twists, -1), torch.stack(cosines, -1)
 
@@ -313,7 +313,7 @@ class TwistShare:
         before = view.activity.before[:, None, limb.ids]
         moved = self.offsets.squashed(seen.add_(before)).sub_(self.offsets.squashed(before))
         square = (moved @ limb.shapes).square().sum(-1)
-        pulled = (moved @ view.pull[:, limb.ids, None]).squeeze(-1)
+        pulled = (moved * view.pull[:, None, limb.ids]).sum(-1)
         return 2 * pulled + scale[:, None].square() * square
 
 

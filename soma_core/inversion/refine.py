@@ -27,7 +27,7 @@ _LOWER, _RAISE, _LEAST_RAISED, _MOST_DAMPING = 0.1, 10.0, 1e-4, 1e4
 """Levenberg damping relative to the diagonal: start, factors after a good and a bad step, least value after a
 bad one, largest."""
 
-_FACTORISED = (0, 1, 3)
+_FACTORISED = (0, 1, 3, 5)
 """Steps at which the matrix is made anew; in between, the memory makes up for what changes."""
 
 _NOISE = {torch.float32: 1e-6, torch.float64: 1e-14}
@@ -137,9 +137,23 @@ class Refinement:
             view = _chosen_view(better, seen, view)
             lower, higher = damping * _LOWER, (damping * _RAISE).clamp(_LEAST_RAISED, _MOST_DAMPING)
             damping = torch.where(better, lower, higher)
-            if bool((moving & ~better).any()):
-                solve = None
+            refused = torch.nonzero(moving & ~better).flatten()
+            if len(refused):
+                solve = self._again(solve, refused, pose, view, damping)
         return pose
+
+    def _again(
+        self, solve: Callable[[Tensor], Tensor], rows: Tensor, pose: Pose, view: View, damping: Tensor
+    ) -> Callable[[Tensor], Tensor]:
+        """`solve` with the matrix of some frames made anew; the others' steps stay what they are."""
+        bound, typical, weight = (
+            None if one is None else one[rows] for one in (self.bound, self.typical, self.weight)
+        )
+        few = Refinement(self.model, self.problem.part(rows), bound, typical)
+        if few.problem.doubt is not None and weight is not None:
+            few.weight, few.doubt = weight, few.problem.doubt.weighed(weight)
+        new = few._inverse(pose.part(rows), _part(view, rows), damping[rows])
+        return lambda slope: solve(slope).index_copy(0, rows, new(slope[rows]))
 
     def _first_view(self, pose: Pose) -> View:
         """The view of the start, which settles how much doubt of twists weighs."""
@@ -189,6 +203,17 @@ class Refinement:
                 left = self.mass * self.typical.square()
             mass = self.weight * left
         return self.model.inverse(problem, pose, view, damping, mass)
+
+
+def _part(view: View, rows: Tensor) -> View:
+    """The view of some frames."""
+
+    def own(value):
+        if isinstance(value, Tensor):
+            return value[rows]
+        return None if value is None else type(value)(**{name: own(one) for name, one in vars(value).items()})
+
+    return own(view)
 
 
 def _chosen(better: Tensor, new: Tensor, old: Tensor) -> Tensor:

@@ -1,13 +1,12 @@
-"""Native bodies of the pose solver: walk, moments, internal coordinates, factorisation, step.
+"""Native bodies of the pose solver: walk, change of the energy, slopes, solution, terms, step.
 
 Every body begins with names of all lists and of the memory of one group of frames (:func:`prelude`). ``S`` is
 that memory, ``C`` an identity's constants: numbers where one identity serves all frames, else vectors.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
-__all__ = ["ACCEPT", "ASSEMBLE", "BEGIN", "CHANGE", "FACTOR", "FORCES", "MODES", "MOVE", "SOLVE", "TERMS", "TWISTS",
-           "WALK", "prelude"]  # fmt: skip
+__all__ = ["ACCEPT", "BEGIN", "CHANGE", "FORCES", "MOVE", "SOLVE", "TERMS", "WALK", "prelude"]
 
 
 def prelude(
@@ -15,13 +14,14 @@ def prelude(
     kept: Sequence[str], *, shared: bool,
 ) -> str:  # fmt: skip
     """Names for everything that the arrays `plan`, `numbers`, `k` and `s` hold."""
-    lines = [f"typedef {'R' if shared else 'V'} C;", "const int* P = plan.data; const C* K = (const C*)k.data;"]
+    lines = [f"typedef {'R' if shared else 'V'} C; const int* P = plan.data; const C* K = (const C*)k.data;"]
     lines.append("V* S = (V*)s.data; V* F = (V*)f.data; const R* Q = numbers.data;")
     at = 0
     for name in counts:
         lines.append(f"const int {name} = P[{at}];")
         at += 1
-    for names, kind, base in ((lists, "const int*", "P"), (numbers, "const R*", "Q"), (slots, "V*", "S"), (kept, "V*", "F")):
+    parts = (lists, "const int*", "P"), (numbers, "const R*", "Q"), (slots, "V*", "S"), (kept, "V*", "F")
+    for names, kind, base in parts:
         for name in names:
             lines.append(f"{kind} {name} = {base} + P[{at}];")
             at += 1
@@ -81,7 +81,8 @@ WALK = """
             }
             for (int h = 0; h < helper_count; h++) {
                 V angle = zero, sine, cosine;
-                for (int i = mix_start[h]; i < mix_start[h+1]; i++) angle += mix_value[i] * twist[mix_channel[i]];
+                for (int i = mix_start[h]; i < mix_start[h+1];
+                    i++) angle += mix_value[i] * twist[mix_channel[i]];
                 for (int n = 0; n < N; n++) {
                     ((R*)&sine)[n] = wp::sin(((R*)&angle)[n]); ((R*)&cosine)[n] = wp::cos(((R*)&angle)[n]);
                 }
@@ -118,7 +119,8 @@ CHANGE = """
         int t = pairs[2*n], u = pairs[2*n+1]; const C* m = second + 16 * n;
         for (int r = 0; r < 3; r++) {
             const V* x = change + 12*t + 4*r; V* y = product + 12*u + 4*r;
-            for (int c = 0; c < 4; c++) y[c] += m[c] * x[0] + m[4+c] * x[1] + m[8+c] * x[2] + m[12+c] * x[3];
+            for (int c = 0; c < 4; c++) y[c] += m[c] * x[0] + m[4+c] * x[1] + m[8+c] * x[2] + m[12+c]
+                * x[3];
         }
         if (t != u) for (int r = 0; r < 3; r++) {
             const V* x = change + 12*u + 4*r; V* y = product + 12*t + 4*r;
@@ -127,7 +129,8 @@ CHANGE = """
         }
     }
     V sum = zero;
-    if (!begin) for (int i = 0; i < 12 * weighted_count; i++) sum += change[i] * (product[i] + R(2) * residual[i]);
+    if (!begin) for (int i = 0; i < 12 * weighted_count;
+        i++) sum += change[i] * (product[i] + R(2) * residual[i]);
     gained[0] = sum;
 """
 
@@ -138,114 +141,6 @@ BEGIN = """
     for (int r = 0; r < 3; r++) hips[r] = trial_hips[r];
     if (forced) for (int i = 0; i < 12 * weighted_count; i++) residual[i] = target[i];
     else for (int i = 0; i < 12 * weighted_count; i++) residual[i] = product[i] - target[i];
-"""
-
-ASSEMBLE = """
-    for (int i = 0; i < 12 * slot_count; i++) blocks[i] = zero;
-    for (int i = 0; i < 4 * column_count; i++) root[i] = zero;
-    for (int i = 0; i < 3 * twist_rows; i++) twists[i] = zero;
-    for (int i = 0; i < 3 * channel_count; i++) twist_force[i] = zero;
-    for (int i = 0; i < channel_count * channel_count; i++) twist_pair[i] = zero;
-    for (int n = 0; n < column_count; n++) {
-        int u = joint[n];
-        for (int e = row_start[n]; e < row_start[n+1]; e++) {
-            V* x = column + 16 * row_joint[e]; for (int c = 0; c < 16; c++) x[c] = zero;
-        }
-        const V* du = turns + 9 * u;
-        for (int e = near_start[n]; e < near_start[n+1]; e++) {
-            int t = near_joint[e]; const C* m = second + 16 * near_pair[e];
-            int row = near_flip[e] ? 1 : 4, col = near_flip[e] ? 4 : 1;
-            const V* dt = turns + 9 * t; V* x = column + 16 * t;
-            for (int r = 0; r < 3; r++) {
-                V d0 = dt[3*r], d1 = dt[3*r+1], d2 = dt[3*r+2];
-                V x0 = m[0] * d0 + m[row] * d1 + m[2*row] * d2;
-                V x1 = m[col] * d0 + m[col+row] * d1 + m[col+2*row] * d2;
-                V x2 = m[2*col] * d0 + m[2*col+row] * d1 + m[2*col+2*row] * d2;
-                x[4*r+3] = m[3*col] * d0 + m[3*col+row] * d1 + m[3*col+2*row] * d2;
-                for (int c = 0; c < 3; c++) x[4*r+c] = x0 * du[3*c] + x1 * du[3*c+1] + x2 * du[3*c+2];
-            }
-            const C* b = m + 3 * row;
-            for (int c = 0; c < 3; c++) x[12+c] = b[0] * du[3*c] + b[col] * du[3*c+1] + b[2*col] * du[3*c+2];
-            x[15] = zero + b[3*col];
-        }
-        for (int e = row_start[n]; e < row_start[n+1]; e++) {
-            int i = row_joint[e]; V* x = column + 16 * i;
-            if (row_slot[e] >= 0) { V* b = blocks + 12 * row_slot[e]; for (int c = 0; c < 12; c++) b[c] += x[c]; }
-            if (i == 0) { for (int c = 0; c < 4; c++) root[4*n+c] += x[12+c]; continue; }
-            int p = row_parent[e]; V* y = column + 16 * p;
-            for (int r = 0; r < 3; r++) {
-                V shift = places[3*i+r] - places[3*p+r];
-                for (int c = 0; c < 4; c++) y[4*r+c] += x[4*r+c] + shift * x[12+c];
-            }
-            for (int c = 0; c < 4; c++) y[12+c] += x[12+c];
-        }
-        if (n < driven_count) {
-            int h = u - joint_count; const R* e = spin_axis + 3 * h; const V* d = turns + 9 * parents[u];
-            V a0 = d[0]*e[0] + d[1]*e[1] + d[2]*e[2], a1 = d[3]*e[0] + d[4]*e[1] + d[5]*e[2];
-            V a2 = d[6]*e[0] + d[7]*e[1] + d[8]*e[2];
-            helper_axis[3*h] = a0; helper_axis[3*h+1] = a1; helper_axis[3*h+2] = a2;
-            for (int i = drive_start[n]; i < drive_start[n+1]; i++) {
-                const V* x = column + 16 * drive_row[i]; V* y = twists + 3 * drive_slot[i]; R m = drive_value[i];
-                V trace = x[0] + x[5] + x[10];
-                y[0] += m * (trace * a0 - x[0] * a0 - x[4] * a1 - x[8] * a2);
-                y[1] += m * (trace * a1 - x[1] * a0 - x[5] * a1 - x[9] * a2);
-                y[2] += m * (trace * a2 - x[2] * a0 - x[6] * a1 - x[10] * a2);
-            }
-            for (int i = cross_start[n]; i < cross_start[n+1]; i++) {
-                int f = cross_row[i]; const V* x = column + 16 * f; R m = cross_value[i];
-                const R* g = spin_axis + 3 * (f - joint_count); const V* q = turns + 9 * parents[f];
-                V b0 = q[0]*g[0] + q[1]*g[1] + q[2]*g[2], b1 = q[3]*g[0] + q[4]*g[1] + q[5]*g[2];
-                V b2 = q[6]*g[0] + q[7]*g[1] + q[8]*g[2];
-                V trace = x[0] + x[5] + x[10];
-                twist_pair[cross_slot[i]] += m * (b0 * (trace * a0 - x[0] * a0 - x[4] * a1 - x[8] * a2)
-                    + b1 * (trace * a1 - x[1] * a0 - x[5] * a1 - x[9] * a2)
-                    + b2 * (trace * a2 - x[2] * a0 - x[6] * a1 - x[10] * a2));
-            }
-            const V* x = column + 12;
-            for (int i = mix_start[h]; i < mix_start[h+1]; i++) {
-                V* y = twist_force + 3 * mix_channel[i]; R m = mix_value[i];
-                y[0] += m * (a1 * x[2] - a2 * x[1]); y[1] += m * (a2 * x[0] - a0 * x[2]);
-                y[2] += m * (a0 * x[1] - a1 * x[0]);
-            }
-        }
-        if (parent_column[n] >= 0) {
-            int p = parent[n], above = parent_column[n];
-            V s0 = places[3*u] - places[3*p], s1 = places[3*u+1] - places[3*p+1], s2 = places[3*u+2] - places[3*p+2];
-            for (int e = push_start[n]; e < push_start[n+1]; e++) for (int r = 0; r < 3; r++) {
-                const V* a = blocks + 12 * push_source[e] + 4*r; V* b = blocks + 12 * push_target[e] + 4*r;
-                V last = a[3];
-                b[0] += a[0] + last * s0; b[1] += a[1] + last * s1; b[2] += a[2] + last * s2; b[3] += last;
-            }
-            V m = root[4*n+3]; V* y = root + 4 * above;
-            y[0] += root[4*n] + m * s0; y[1] += root[4*n+1] + m * s1; y[2] += root[4*n+2] + m * s2; y[3] += m;
-        }
-    }
-    for (int i = 0; i < slot_count; i++) {
-        V* b = blocks + 12 * i; V x = b[0], y = b[5], z = b[10];
-        b[0] = y + z; b[5] = x + z; b[10] = x + y;
-        for (int r = 0; r < 3; r++) for (int c = 0; c < r; c++) {
-            V lower = b[4*r+c]; b[4*r+c] = -b[4*c+r]; b[4*c+r] = -lower;
-        }
-    }
-"""
-
-_PLACED = """
-#define PLACE(block, kind, y, g) do { V* b_ = blocks + 12 * (block); \\
-        if ((kind) == 0) { for (int r = 0; r < 3; r++) for (int c = 0; c < 3; c++) \\
-            b_[4*r+c] += (y)[r] * (g)[c] + (g)[r] * (y)[c]; } \\
-        else if ((kind) == 1) { for (int r = 0; r < 3; r++) for (int c = 0; c < 3; c++) b_[4*r+c] += (y)[r] * (g)[c]; } \\
-        else { for (int r = 0; r < 3; r++) for (int c = 0; c < 3; c++) b_[4*r+c] += (g)[r] * (y)[c]; } } while (0)
-"""
-
-TWISTS = _PLACED + """
-    for (int i = 0; i < add_count; i++) {
-        V half = R(0.5) * twist_pair[add_pair[i]]; const V* g = steer + 3 * add_channel[i]; V* y = twists + 3 * add_slot[i];
-        for (int r = 0; r < 3; r++) y[r] += half * g[r];
-    }
-    for (int i = 0; i < twist_count; i++) {
-        const V* y = twists + 3 * twist_slot[i]; const V* g = steer + 3 * twist_channel[i];
-        PLACE(twist_block[i], twist_kind[i], y, g);
-    }
 """
 
 FORCES = """
@@ -272,186 +167,17 @@ FORCES = """
     for (int r = 0; r < 3; r++) slope[3*column_count+r] = force[r];
     for (int c = 0; c < channel_count; c++) twist[c] = zero;
     for (int n = 0; n < driven_count; n++) {
-        int h = joint[n] - joint_count; const R* e = spin_axis + 3*h; const V* d = turns + 9 * parents[joint[n]];
+        int h = joint[n] - joint_count; const R* e = spin_axis + 3*h;
+            const V* d = turns + 9 * parents[joint[n]];
         V torque = zero;
         for (int r = 0; r < 3; r++) torque += slope[3*n+r] * (d[3*r]*e[0] + d[3*r+1]*e[1] + d[3*r+2]*e[2]);
         for (int i = mix_start[h]; i < mix_start[h+1]; i++) twist[mix_channel[i]] += mix_value[i] * torque;
     }
     for (int i = 0; i < chain_count; i++) {
-        V* y = slope + 3 * chain_column[i]; const V* g = steer + 3 * chain_channel[i]; V t = twist[chain_channel[i]];
+        V* y = slope + 3 * chain_column[i]; const V* g = steer + 3 * chain_channel[i];
+            V t = twist[chain_channel[i]];
         for (int r = 0; r < 3; r++) y[r] += t * g[r];
     }
-"""
-
-MODES = _PLACED + """
-    V size = scale[0], most = size * shares[weighted_count];
-    for (int i = 0; i < 9 * column_count; i++) mode_force[i] = zero;
-    const int W = 3 * feature_columns;
-    for (int i = 0; i < used_count; i++) {
-        int j = used_joint[i]; const V* a = turns + 9 * (parents[j] < 0 ? 0 : parents[j]); const V* x = relative + 9*j;
-        const R* l = left + 9*i; const R* d = right + W*i;
-        for (int w = 0; w < 3; w++) {
-            V k0 = a[3*w], k1 = a[3*w+1], k2 = a[3*w+2], m[9], y[9];
-            for (int c = 0; c < 3; c++) {
-                m[c] = k1 * x[6+c] - k2 * x[3+c]; m[3+c] = k2 * x[c] - k0 * x[6+c]; m[6+c] = k0 * x[3+c] - k1 * x[c];
-            }
-            for (int r = 0; r < 3; r++) for (int c = 0; c < 3; c++)
-                y[3*r+c] = l[3*r] * m[c] + l[3*r+1] * m[3+c] + l[3*r+2] * m[6+c];
-            for (int r = 0; r < 3; r++) for (int c = 0; c < feature_columns; c++) {
-                V sum = zero; for (int q = 0; q < 3; q++) sum += y[3*r+q] * d[q*feature_columns+c];
-                features[3*W*i + W*w + r*feature_columns + c] = sum;
-            }
-        }
-    }
-    const R* gates = gate; const R* mixed = mode;
-    for (int p = 0; p < block_count; p++) {
-        int reads = read_start[p+1] - read_start[p], size_p = mode_size[p], ids = taken_start[p+1] - taken_start[p];
-        V* out = response + response_start[p];
-        for (int i = 0; i < 3 * size_p * reads; i++) out[i] = zero;
-        for (int c = 0; c < ids; c++) {
-            V open = activity[taken[taken_start[p] + c]];
-            for (int r = 0; r < reads; r++, gates += W) {
-                const V* x = features + 3*W * read_used[read_start[p] + r]; V v0 = zero, v1 = zero, v2 = zero;
-                for (int q = 0; q < W; q++) { v0 += gates[q] * x[q]; v1 += gates[q] * x[W+q]; v2 += gates[q] * x[2*W+q]; }
-                v0 *= open; v1 *= open; v2 *= open;
-                for (int m = 0; m < size_p; m++) {
-                    R f = mixed[m*ids+c]; V* y = out + 3 * (m*reads + r);
-                    y[0] += f * v0; y[1] += f * v1; y[2] += f * v2;
-                }
-            }
-        }
-        mixed += size_p * ids;
-    }
-    const R* moment = cloud_moment; const R* grams = gram; const int* into = near_rows;
-    for (int p = 0; p < block_count; p++) {
-        int rows = mode_row_count[p], size_p = mode_size[p], first = tree_start[p], nodes = tree_start[p+1] - first;
-        int reads = read_start[p+1] - read_start[p];
-        V* tree = mode_tree; V* y = mode_rows;
-        for (int i = 0; i < 6 * size_p * nodes; i++) tree[i] = zero;
-        for (int i = 0; i < 3 * size_p * (rows + 1); i++) y[i] = zero;
-        for (int e = cloud_start[p]; e < cloud_start[p+1]; e++) {
-            int node = cloud_tree[e]; const V* d = turns + 9 * tree_joint[first + node];
-            V share = zero + shares[cloud_weighted[e]], arm = share * sizes[cloud_weighted[e]];
-            for (int m = 0; m < size_p; m++, moment += 6) {
-                V* x = tree + 6 * (size_p * node + m);
-                for (int r = 0; r < 3; r++) {
-                    x[r] += arm * (d[3*r] * moment[0] + d[3*r+1] * moment[1] + d[3*r+2] * moment[2]);
-                    x[3+r] += share * (d[3*r] * moment[3] + d[3*r+1] * moment[4] + d[3*r+2] * moment[5]);
-                }
-            }
-        }
-        int f = fold_start[p];
-        for (int node = 0; node < nodes; node++) {
-            int j = tree_joint[first + node], up = tree_up[first + node], row = tree_row[first + node];
-            for (; f < fold_start[p+1] && fold_tree[f] == node; f++) {
-                const V* a = helper_axis + 3 * fold_helper[f]; const V* g = steer + 3 * fold_channel[f];
-                for (int m = 0; m < size_p; m++) {
-                    const V* x = tree + 6 * (size_p * node + m); V* o = y + 3 * (size_p * fold_row[f] + m);
-                    V t = fold_value[f] * (a[0] * x[0] + a[1] * x[1] + a[2] * x[2]);
-                    for (int r = 0; r < 3; r++) o[r] += t * g[r];
-                }
-            }
-            int at = j == 0 ? rows : row;
-            if (at >= 0) for (int m = 0; m < size_p; m++) {
-                const V* x = tree + 6 * (size_p * node + m) + (j == 0 ? 3 : 0); V* o = y + 3 * (size_p * at + m);
-                for (int r = 0; r < 3; r++) o[r] += x[r];
-            }
-            if (up < 0) continue;
-            int q = tree_joint[first + up];
-            V s0 = places[3*j] - places[3*q], s1 = places[3*j+1] - places[3*q+1], s2 = places[3*j+2] - places[3*q+2];
-            for (int m = 0; m < size_p; m++) {
-                const V* x = tree + 6 * (size_p * node + m); V* o = tree + 6 * (size_p * up + m);
-                o[0] += x[0] + s1 * x[5] - s2 * x[4]; o[1] += x[1] + s2 * x[3] - s0 * x[5];
-                o[2] += x[2] + s0 * x[4] - s1 * x[3];
-                o[3] += x[3]; o[4] += x[4]; o[5] += x[5];
-            }
-        }
-        for (int e = near_start_mode[p]; e < near_start_mode[p+1]; e++) {
-            int b = near_block[e], size_b = mode_size[b], seen = read_start[b+1] - read_start[b];
-            for (int m = 0; m < size_p; m++) for (int l = 0; l < size_b; l++) {
-                V h = (R(0.5) * grams[m*size_b+l]) * most; const V* x = response + response_start[b] + 3*l*seen;
-                for (int r = 0; r < seen; r++) {
-                    V* o = y + 3 * (size_p * into[r] + m);
-                    o[0] += h * x[3*r]; o[1] += h * x[3*r+1]; o[2] += h * x[3*r+2];
-                }
-            }
-            grams += size_p * size_b; into += seen;
-        }
-        const V* a = response + response_start[p];
-        for (int e = apply_start[p]; e < apply_start[p+1]; e++) {
-            V sum[9]; for (int i = 0; i < 9; i++) sum[i] = zero;
-            const V* u = y + 3 * size_p * apply_row[e];
-            for (int m = 0; m < size_p; m++) {
-                const V* g = a + 3 * (m*reads + apply_read[e]); const V* v = u + 3*m;
-                for (int r = 0; r < 3; r++) for (int c = 0; c < 3; c++) sum[3*r+c] += v[r] * g[c];
-            }
-            V* b = blocks + 12 * apply_block[e];
-            for (int r = 0; r < 3; r++) for (int c = 0; c < 3; c++) {
-                if (apply_kind[e] == 0) b[4*r+c] += size * (sum[3*r+c] + sum[3*c+r]);
-                else if (apply_kind[e] == 1) b[4*r+c] += size * sum[3*r+c];
-                else b[4*r+c] += size * sum[3*c+r];
-            }
-        }
-        for (int r = 0; r < reads; r++) {
-            V* t = mode_force + 9 * read_column[read_start[p] + r];
-            for (int m = 0; m < size_p; m++) {
-                const V* g = a + 3 * (m*reads + r); const V* v = y + 3 * (size_p * rows + m);
-                for (int i = 0; i < 3; i++) for (int c = 0; c < 3; c++) t[3*i+c] += size * v[i] * g[c];
-            }
-        }
-    }
-"""
-
-FACTOR = """
-    V whole = zero, mean = zero;
-    for (int n = driven_count; n < column_count; n++) {
-        V* x = carry + 9*n; const V* t = root + 4*n;
-        if (parent_column[n] < 0) whole += t[3];
-        const V* d = blocks + 12 * block_start[n]; mean += d[0] + d[5] + d[10];
-        const V* more = mode_force + 9*n;
-        for (int i = 0; i < 9; i++) x[i] = block_count ? more[i] : zero;
-        x[1] += t[2]; x[2] -= t[1]; x[3] -= t[2]; x[5] += t[0]; x[6] += t[1]; x[7] -= t[0];
-    }
-    for (int i = 0; i < chain_count; i++) {
-        V* x = carry + 9 * chain_column[i]; const V* f = twist_force + 3 * chain_channel[i];
-        const V* g = steer + 3 * chain_channel[i];
-        for (int r = 0; r < 3; r++) for (int c = 0; c < 3; c++) x[3*r+c] += f[r] * g[c];
-    }
-    V grow = one + damping[0];
-    V ridge = (R(1e-9) / R(3 * (column_count - driven_count) + 3)) * (mean + R(3) * whole);
-    for (int n = driven_count; n < column_count; n++) for (int r = 0; r < 3; r++) {
-        V* d = blocks + 12 * block_start[n] + 5*r; d[0] = d[0] * grow + ridge;
-    }
-    for (int i = 0; i < 9; i++) last[i] = zero;
-    for (int r = 0; r < 3; r++) last[4*r] = whole * grow + ridge;
-    #define INVERSE(y, x) do { V x_ = (x); for (int n_ = 0; n_ < N; n_++) { R v_ = ((R*)&x_)[n_]; \\
-        ((R*)&x_)[n_] = v_ > R(1e-30) ? v_ : R(1e-30); } y = R(1) / ROOT(x_); } while (0)
-    #define TRIANGLE(a, w, i) do { V i0, i1, i2; INVERSE(i0, (a)[0]); \\
-        V l10_ = (a)[w] * i0, l20_ = (a)[2*(w)] * i0; INVERSE(i1, (a)[(w)+1] - l10_ * l10_); \\
-        V l21_ = ((a)[2*(w)+1] - l20_ * l10_) * i1; \\
-        INVERSE(i2, (a)[2*(w)+2] - l20_ * l20_ - l21_ * l21_); \\
-        (a)[w] = l10_; (a)[2*(w)] = l20_; (a)[2*(w)+1] = l21_; (i)[0] = i0; (i)[1] = i1; (i)[2] = i2; } while (0)
-    #define ELIMINATE(o, w, a, wa, b, wb) do { for (int r_ = 0; r_ < 3; r_++) for (int c_ = 0; c_ < 3; c_++) \\
-        (o)[(w)*r_+c_] -= (a)[(wa)*r_] * (b)[(wb)*c_] + (a)[(wa)*r_+1] * (b)[(wb)*c_+1] \\
-            + (a)[(wa)*r_+2] * (b)[(wb)*c_+2]; } while (0)
-    for (int n = driven_count; n < column_count; n++) {
-        int first = block_start[n], stop = block_start[n+1], e = update_start[n];
-        V* d = blocks + 12 * first; V* i = inverse + 3*n;
-        TRIANGLE(d, 4, i);
-        V l10 = d[4], l20 = d[8], l21 = d[9];
-        for (int q = first + 1; q <= stop; q++) for (int r = 0; r < 3; r++) {
-            V* b = q < stop ? blocks + 12*q + 4*r : carry + 9*n + 3*r;
-            V x = b[0] * i[0], y = (b[1] - x * l10) * i[1];
-            b[0] = x; b[1] = y; b[2] = (b[2] - x * l20 - y * l21) * i[2];
-        }
-        for (int a = first + 1; a < stop; a++) {
-            for (int b = a; b < stop; b++, e++)
-                ELIMINATE(blocks + 12 * update_target[e], 4, blocks + 12*b, 4, blocks + 12*a, 4);
-            ELIMINATE(carry + 9 * block_row[a], 3, carry + 9*n, 3, blocks + 12*a, 4);
-        }
-        ELIMINATE(last, 3, carry + 9*n, 3, carry + 9*n, 3);
-    }
-    TRIANGLE(last, 3, inverse + 3 * column_count);
 """
 
 SOLVE = """
@@ -461,7 +187,8 @@ SOLVE = """
         x[0] = y0; x[1] = y1; x[2] = y2;
         for (int q = block_start[n] + 1; q <= block_start[n+1]; q++) {
             bool own = q < block_start[n+1];
-            V* o = slope + 3 * (own ? block_row[q] : column_count); const V* b = own ? blocks + 12*q : carry + 9*n;
+            V* o = slope + 3 * (own ? block_row[q] : column_count);
+                const V* b = own ? blocks + 12*q : carry + 9*n;
             int w = own ? 4 : 3;
             for (int r = 0; r < 3; r++) o[r] -= b[w*r] * y0 + b[w*r+1] * y1 + b[w*r+2] * y2;
         }
@@ -475,9 +202,11 @@ SOLVE = """
         V z0 = x[0], z1 = x[1], z2 = x[2];
         for (int q = block_start[n] + 1; q <= block_start[n+1]; q++) {
             bool own = q < block_start[n+1];
-            const V* o = slope + 3 * (own ? block_row[q] : column_count); const V* b = own ? blocks + 12*q : carry + 9*n;
+            const V* o = slope + 3 * (own ? block_row[q] : column_count);
+                const V* b = own ? blocks + 12*q : carry + 9*n;
             int w = own ? 4 : 3;
-            for (int r = 0; r < 3; r++) { z0 -= b[w*r] * o[r]; z1 -= b[w*r+1] * o[r]; z2 -= b[w*r+2] * o[r]; }
+            for (int r = 0; r < 3; r++) { z0 -= b[w*r] * o[r]; z1 -= b[w*r+1] * o[r];
+                z2 -= b[w*r+2] * o[r]; }
         }
         z2 = z2 * v[2]; z1 = (z1 - d[9] * z2) * v[1]; z0 = (z0 - d[4] * z1 - d[8] * z2) * v[0];
         x[0] = z0; x[1] = z1; x[2] = z2;
@@ -486,7 +215,8 @@ SOLVE = """
 
 _DEVIATION = """
 #define DEVIATE(q, rel) \\
-        int k_ = soft[q]; const V* x = (rel) + 9 * joint[k_]; const V* y = (const V*)reference.data + 9*(q); \\
+        int k_ = soft[q]; const V* x = (rel) + 9 * joint[k_]; \\
+        const V* y = (const V*)reference.data + 9*(q); \\
         V tr_ = zero; for (int i = 0; i < 9; i++) tr_ += x[i] * y[i]; \\
         V a0 = zero, a1 = zero, a2 = zero; \\
         for (int i = 0; i < 3; i++) { a0 += x[6+i] * y[3+i] - x[3+i] * y[6+i]; \\
@@ -499,7 +229,9 @@ _DEVIATION = """
         a0 *= reach; a1 *= reach; a2 *= reach;
 """
 
-TERMS = _DEVIATION + """
+TERMS = (
+    _DEVIATION
+    + """
     const int* soft = softs.data; const R* stiff = stiffs.data;
     V total = zero;
     for (int q = 0; q < soft_count; q++) {
@@ -514,7 +246,8 @@ TERMS = _DEVIATION + """
             ((R*)&across)[n] = t; ((R*)&along)[n] = o > 0 ? s_ : t;
         }
         const V* d = turns + 9 * parent[k_]; V w[3];
-        for (int r = 0; r < 3; r++) { w[r] = d[3*r]*a0 + d[3*r+1]*a1 + d[3*r+2]*a2; slope[3*k_+r] += own * over * w[r]; }
+        for (int r = 0; r < 3; r++) { w[r] = d[3*r]*a0 + d[3*r+1]*a1 + d[3*r+2]*a2;
+            slope[3*k_+r] += own * over * w[r]; }
         V* b = blocks + 12 * block_start[k_];
         for (int r = 0; r < 3; r++) {
             b[5*r] += across;
@@ -528,9 +261,11 @@ TERMS = _DEVIATION + """
         const V* d = turns + 9 * parent[n]; V* b = blocks + 12 * block_start[n]; V w[3];
         for (int r = 0; r < 3; r++) w[r] = d[3*r]*e[0] + d[3*r+1]*e[1] + d[3*r+2]*e[2];
         V big = stiffness * (b[0] + b[5] + b[10]);
-        for (int r = 0; r < 3; r++) { b[5*r] += big; for (int c = 0; c < 3; c++) b[4*r+c] -= big * w[r] * w[c]; }
+        for (int r = 0; r < 3; r++) { b[5*r] += big; for (int c = 0; c < 3;
+            c++) b[4*r+c] -= big * w[r] * w[c]; }
     }
 """
+)
 
 MOVE = """
     const R* hinge = stiffs.data + 2 * soft_count;

@@ -1,0 +1,96 @@
+"""Native functions of the pose solver's kernels."""
+
+import functools
+from types import SimpleNamespace
+
+import warp as wp
+
+from soma_core.kernels import _matrix_text as matrix
+from soma_core.kernels import _solver_text as text
+from soma_core.kernels import _variance_text as variance
+from soma_core.kernels._native import native
+from soma_core.kernels._solver_layout import COUNTS, KEPT, LISTS, NUMBERS, SLOTS
+
+__all__ = ["Task", "solver_functions"]
+
+_ids = wp.array(dtype=wp.int32)
+
+
+@functools.cache
+def solver_functions(scalar: str, lanes: int, *, shared: bool) -> SimpleNamespace:
+    real = wp.array(dtype=getattr(wp, scalar))
+    number = getattr(wp, scalar)
+    begin = text.prelude(COUNTS, LISTS, NUMBERS, SLOTS, KEPT, shared=shared)
+
+    def made(body: str, stub):
+        stub.__name__ += "_one" if shared else "_each"
+        return native(begin + body, scalar, lanes, stub)
+
+    def walk(plan: _ids, numbers: real, k: real, s: real, f: real, trial: int): ...
+
+    def change(plan: _ids, numbers: real, k: real, s: real, f: real, begin: int): ...
+
+    def copy(plan: _ids, numbers: real, k: real, s: real, f: real, forced: int): ...
+
+    def assemble(plan: _ids, numbers: real, k: real, s: real, f: real): ...
+
+    def twists(plan: _ids, numbers: real, k: real, s: real, f: real): ...
+
+    def forces(plan: _ids, numbers: real, k: real, s: real, f: real): ...
+
+    def modes(plan: _ids, numbers: real, k: real, s: real, f: real): ...
+
+    def factor(plan: _ids, numbers: real, k: real, s: real, f: real): ...
+
+    def solve(plan: _ids, numbers: real, k: real, s: real, f: real): ...
+
+    def selected(plan: _ids, numbers: real, k: real, s: real, f: real): ...
+
+    def terms(
+        plan: _ids, numbers: real, k: real, s: real, f: real, softs: _ids, stiffs: real, reference: real,
+        soft_count: int, hinge_end: int, stiffness: number, trial: int,
+    ): ...  # fmt: skip
+
+    def move(
+        plan: _ids, numbers: real, k: real, s: real, f: real, stiffs: real, soft_count: int, hinge_end: int,
+        longest: number,
+    ): ...  # fmt: skip
+
+    def accept(
+        plan: _ids, numbers: real, k: real, s: real, f: real, lower: number, higher: number, least: number,
+        most: number,
+    ) -> int:  # fmt: skip
+        return 0
+
+    def root_turn(plan: _ids, numbers: real, k: real, s: real, f: real, damping_start: number): ...
+
+    still = """
+        for (int i = 0; i < 9; i++) {
+            turns[i] = trial_turns[i] = relative[i] = trial_relative[i] = i % 4 ? zero : one;
+        }
+        for (int r = 0; r < 3; r++) places[r] = trial_places[r] = zero;
+        damping[0] = zero + damping_start; moving[0] = one; accepted[0] = zero; soft_energy[0] = zero;
+    """
+    bodies = {
+        "walk": (text.WALK, walk), "change": (text.CHANGE, change), "copy": (text.BEGIN, copy),
+        "assemble": (matrix.ASSEMBLE, assemble), "twists": (matrix.TWISTS, twists),
+        "forces": (text.FORCES, forces),
+        "modes": (matrix.MODES, modes), "factor": (matrix.FACTOR, factor), "solve": (text.SOLVE, solve),
+        "terms": (text.TERMS, terms), "move": (text.MOVE, move), "accept": (text.ACCEPT, accept),
+        "still": (still, root_turn), "selected": (variance.SELECTED, selected),
+    }  # fmt: skip
+    return SimpleNamespace(**{name: made(*given) for name, given in bodies.items()})
+
+
+@wp.struct
+class Task:
+    """Counts of one launch; groups begin .. end of frames."""
+
+    begin: int
+    end: int
+    frames: int
+    iterations: int
+    forced: int
+    soft_count: int
+    hinge_end: int
+    outcome: int

@@ -1,0 +1,151 @@
+"""Single steps of the pose solver in Warp: the tree, slopes, and the factorised matrix of the whole model."""
+
+import functools
+from types import SimpleNamespace
+
+import warp as wp
+
+from soma_core.kernels._native import transposing
+from soma_core.kernels._solver_functions import Task, solver_functions
+
+__all__ = ["factor_kernel", "solution_kernels", "tree_kernels"]
+
+_ids = wp.array(dtype=wp.int32)
+
+
+def _enter(scalar: str, lanes: int, *, shared: bool):
+    """Brings the pose of a group of frames into lanes, and walks down its tree."""
+    number = getattr(wp, scalar)
+    real, body = wp.array(dtype=number), solver_functions(scalar, lanes, shared=shared)
+    (load, _), walk, still = transposing(scalar, lanes), body.walk, body.still
+
+    @wp.func
+    def enter(
+        plan: _ids,
+        numbers: real,
+        k: real,
+        s: real,
+        m: real,
+        at: _ids,
+        f: int,
+        last: int,
+        relative: real,
+        hips: real,
+    ):
+        still(plan, numbers, k, s, m, number(0.0))
+        load(relative, wp.int64(at[5]), 0, at[5], f, last, s, at[7])
+        load(hips, wp.int64(3), 0, 3, f, last, s, at[8])
+        walk(plan, numbers, k, s, m, 0)
+
+    return enter
+
+
+@functools.cache
+def tree_kernels(scalar: str, lanes: int, *, shared: bool) -> SimpleNamespace:
+    """The tree of a pose, and what residuals ask of its joints."""
+    number = getattr(wp, scalar)
+    real, rows = wp.array(dtype=number), wp.array2d(dtype=number)
+    forces, width = solver_functions(scalar, lanes, shared=shared).forces, lanes
+    (load, store), enter = transposing(scalar, lanes), _enter(scalar, lanes, shared=shared)
+    module = wp.get_module(f"soma_pose_tree_{scalar}_{lanes}_{'one' if shared else 'each'}")
+
+    @wp.kernel(module=module, enable_backward=False)
+    def walked(
+        task: Task, plan: _ids, numbers: real, constants: rows, memory: rows, kept: rows, at: _ids,
+        relative: real, hips: real, turns: real, places: real,
+    ):  # fmt: skip
+        w = wp.tid()
+        for g in range(task.begin + w, task.end, memory.shape[0]):
+            f, last = g * width, task.frames - 1
+            s, m, k = memory[w], kept[w], constants[wp.min(g, constants.shape[0] - 1)]
+            enter(plan, numbers, k, s, m, at, f, last, relative, hips)
+            store(s, at[11], at[12], turns, wp.int64(at[12]), 0, f, last)
+            store(s, at[13], at[14], places, wp.int64(at[14]), 0, f, last)
+
+    @wp.kernel(module=module, enable_backward=False)
+    def slopes(
+        task: Task, plan: _ids, numbers: real, constants: rows, memory: rows, kept: rows, at: _ids,
+        relative: real, hips: real, residual: real, slope: real,
+    ):  # fmt: skip
+        w = wp.tid()
+        for g in range(task.begin + w, task.end, memory.shape[0]):
+            f, last = g * width, task.frames - 1
+            s, m, k = memory[w], kept[w], constants[wp.min(g, constants.shape[0] - 1)]
+            enter(plan, numbers, k, s, m, at, f, last, relative, hips)
+            load(residual, wp.int64(at[6]), 0, at[6], f, last, s, at[15])
+            forces(plan, numbers, k, s, m)
+            store(s, at[16], at[17], slope, wp.int64(at[17]), 0, f, last)
+
+    return SimpleNamespace(walked=walked, slopes=slopes)
+
+
+@functools.cache
+def factor_kernel(scalar: str, lanes: int, *, shared: bool):
+    """The factorised matrix of the whole model."""
+    number = getattr(wp, scalar)
+    real, rows = wp.array(dtype=number), wp.array2d(dtype=number)
+    body, width = solver_functions(scalar, lanes, shared=shared), lanes
+    assemble, twists, modes = body.assemble, body.twists, body.modes
+    factor, terms = body.factor, body.terms
+    (load, _), enter = transposing(scalar, lanes), _enter(scalar, lanes, shared=shared)
+    module = wp.get_module(f"soma_pose_factor_{scalar}_{lanes}_{'one' if shared else 'each'}")
+
+    @wp.kernel(module=module, enable_backward=False)
+    def factorise(
+        task: Task, plan: _ids, numbers: real, constants: rows, memory: rows, kept: rows, at: _ids,
+        softs: _ids, stiffs: real, reference: rows, stiffness: number,
+        relative: real, hips: real, damping: real, mass: real, activity: real, scale: real,
+    ):  # fmt: skip
+        w = wp.tid()
+        for g in range(task.begin + w, task.end, memory.shape[0]):
+            f, last = g * width, task.frames - 1
+            s, m, k = memory[w], kept[g], constants[wp.min(g, constants.shape[0] - 1)]
+            own = reference[wp.min(g, reference.shape[0] - 1)]
+            enter(plan, numbers, k, s, m, at, f, last, relative, hips)
+            load(damping, wp.int64(1), 0, 1, f, last, s, at[18])
+            load(mass, wp.int64(1), 0, 1, f, last, s, at[4])
+            assemble(plan, numbers, k, s, m)
+            twists(plan, numbers, k, s, m)
+            if at[20] > 0:
+                load(activity, wp.int64(at[20]), 0, at[20], f, last, s, at[19])
+                load(scale, wp.int64(1), 0, 1, f, last, s, at[21])
+                modes(plan, numbers, k, s, m)
+            terms(plan, numbers, k, s, m, softs, stiffs, own, task.soft_count, task.hinge_end, stiffness, 0)
+            factor(plan, numbers, k, s, m)
+
+    return factorise
+
+
+@functools.cache
+def solution_kernels(scalar: str, lanes: int) -> SimpleNamespace:
+    """What a factorised matrix is asked for: solutions, and the variables' variances."""
+    number = getattr(wp, scalar)
+    real, rows = wp.array(dtype=number), wp.array2d(dtype=number)
+    body, width = solver_functions(scalar, lanes, shared=True), lanes
+    (load, store), solve, selected = transposing(scalar, lanes), body.solve, body.selected
+    module = wp.get_module(f"soma_pose_solution_{scalar}_{lanes}")
+
+    @wp.kernel(module=module, enable_backward=False)
+    def solved(
+        task: Task, plan: _ids, numbers: real, constants: rows, memory: rows, kept: rows, at: _ids,
+        slope: real, out: real,
+    ):  # fmt: skip
+        w = wp.tid()
+        for g in range(task.begin + w, task.end, memory.shape[0]):
+            f, last = g * width, task.frames - 1
+            s, m, k = memory[w], kept[g], constants[0]
+            load(slope, wp.int64(at[17]), 0, at[17], f, last, s, at[16])
+            solve(plan, numbers, k, s, m)
+            store(s, at[16], at[17], out, wp.int64(at[17]), 0, f, last)
+
+    @wp.kernel(module=module, enable_backward=False)
+    def varied(
+        task: Task, plan: _ids, numbers: real, constants: rows, memory: rows, kept: rows, at: _ids, out: real
+    ):
+        w, count = wp.tid(), at[17] // 3 - 1
+        for g in range(task.begin + w, task.end, memory.shape[0]):
+            s, m, k = memory[w], kept[g], constants[0]
+            selected(plan, numbers, k, s, m)
+            store(s, at[16], count, out, wp.int64(count), 0, g * width, task.frames - 1)
+
+    return SimpleNamespace(solved=solved, varied=varied)
