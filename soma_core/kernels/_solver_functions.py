@@ -64,20 +64,13 @@ def solver_functions(scalar: str, lanes: int, *, shared: bool) -> SimpleNamespac
 
     def root_turn(plan: _ids, numbers: real, k: real, s: real, f: real, damping_start: number): ...
 
-    still = """
-        for (int i = 0; i < 9; i++) {
-            turns[i] = trial_turns[i] = relative[i] = trial_relative[i] = i % 4 ? zero : one;
-        }
-        for (int r = 0; r < 3; r++) places[r] = trial_places[r] = zero;
-        damping[0] = zero + damping_start; moving[0] = one; accepted[0] = zero; soft_energy[0] = zero;
-    """
     bodies = {
         "walk": (text.WALK, walk), "change": (text.CHANGE, change), "copy": (text.BEGIN, copy),
         "assemble": (matrix.ASSEMBLE, assemble), "twists": (matrix.TWISTS, twists),
         "forces": (text.FORCES, forces),
         "modes": (matrix.MODES, modes), "factor": (matrix.FACTOR, factor), "solve": (text.SOLVE, solve),
         "terms": (text.TERMS, terms), "move": (text.MOVE, move), "accept": (text.ACCEPT, accept),
-        "still": (still, root_turn), "selected": (variance.SELECTED, selected),
+        "still": (text.STILL, root_turn), "selected": (variance.SELECTED, selected),
     }  # fmt: skip
     return SimpleNamespace(**{name: made(*given) for name, given in bodies.items()})
 

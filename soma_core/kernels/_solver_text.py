@@ -6,7 +6,7 @@ that memory, ``C`` an identity's constants: numbers where one identity serves al
 
 from collections.abc import Sequence
 
-__all__ = ["ACCEPT", "BEGIN", "CHANGE", "FORCES", "MOVE", "SOLVE", "TERMS", "WALK", "prelude"]
+__all__ = ["ACCEPT", "BEGIN", "CHANGE", "FORCES", "MOVE", "SOLVE", "STILL", "TERMS", "WALK", "prelude"]
 
 
 def prelude(
@@ -32,6 +32,14 @@ def prelude(
     lines.append("const V zero = V{}; const V one = zero + R(1);")
     return "\n".join(lines) + "\n"
 
+
+STILL = """
+    for (int i = 0; i < 9; i++) {
+        turns[i] = trial_turns[i] = relative[i] = trial_relative[i] = i % 4 ? zero : one;
+    }
+    for (int r = 0; r < 3; r++) places[r] = trial_places[r] = zero;
+    damping[0] = zero + damping_start; moving[0] = one; accepted[0] = zero; soft_energy[0] = zero;
+"""
 
 WALK = """
     V* rel = trial ? trial_relative : relative; V* tr = trial ? trial_turns : turns;
