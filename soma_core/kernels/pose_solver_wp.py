@@ -28,23 +28,13 @@ _ids = wp.array(dtype=wp.int32)
 
 @functools.cache
 def _kernel(scalar: str, lanes: int, *, shared: bool):
-    real, rows, number = (
-        wp.array(dtype=getattr(wp, scalar)),
-        wp.array2d(dtype=getattr(wp, scalar)),
-        getattr(wp, scalar),
-    )
+    number = getattr(wp, scalar)
+    real, rows = wp.array(dtype=number), wp.array2d(dtype=number)
     body, width = solver_functions(scalar, lanes, shared=shared), lanes
     load, store = transposing(scalar, lanes)
     walk, change, copy, assemble, twists = body.walk, body.change, body.copy, body.assemble, body.twists
-    forces, factor, solve, terms, move, accept = (
-        body.forces,
-        body.factor,
-        body.solve,
-        body.terms,
-        body.move,
-        body.accept,
-    )
-    still = body.still
+    forces, factor, solve, terms = body.forces, body.factor, body.solve, body.terms
+    move, accept, still = body.move, body.accept, body.still
     module = wp.get_module(f"soma_pose_solver_{scalar}_{lanes}_{'one' if shared else 'each'}")
 
     @wp.kernel(module=module, enable_backward=False)
@@ -73,17 +63,13 @@ def _kernel(scalar: str, lanes: int, *, shared: bool):
                 assemble(plan, numbers, k, s, m)
                 twists(plan, numbers, k, s, m)
                 forces(plan, numbers, k, s, m)
-                terms(
-                    plan, numbers, k, s, m, softs, stiffs, own, task.soft_count, task.hinge_end, stiffness, 0
-                )
+                terms(plan, numbers, k, s, m, softs, stiffs, own, count, hinge_end, stiffness, 0)
                 factor(plan, numbers, k, s, m)
                 solve(plan, numbers, k, s, m)
                 move(plan, numbers, k, s, m, stiffs, count, hinge_end, longest)
                 walk(plan, numbers, k, s, m, 1)
                 change(plan, numbers, k, s, m, 0)
-                terms(
-                    plan, numbers, k, s, m, softs, stiffs, own, task.soft_count, task.hinge_end, stiffness, 1
-                )
+                terms(plan, numbers, k, s, m, softs, stiffs, own, count, hinge_end, stiffness, 1)
                 if accept(plan, numbers, k, s, m, damping[1], damping[2], damping[3], damping[4]) == 0:
                     break
             store(s, at[7], at[5], relative_out, turn, 0, f, last)
