@@ -117,8 +117,12 @@ class AutogradChoice:
 
 @dataclass
 class PriorChoice:
-    """Soft terms [m/rad]: limits of joints [rad], a rest pose, smooth motion; hinges: elbows and knees."""
+    """Soft terms [m/rad]: limits of joints [rad], a rest pose, smooth motion; hinges: elbows and knees.
 
+    `untwist` is a factor on how much twists of elbows, knees and fingers are in doubt; 0 turns that off.
+    """
+
+    untwist: float = 1.0
     limits: dict[str, float] = field(default_factory=dict)
     limit_strength: float = 0.05
     hinges: bool = False

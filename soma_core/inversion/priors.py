@@ -67,6 +67,7 @@ class PosePriors:
 
     Attributes:
         untwisted: joint name -> axis and doubt, as in ``UNTWISTED``.
+        untwist: factor on every doubt; 0 turns them off.
         limits: joint name -> largest angle from the T-pose [rad]; beyond it `limit_strength` pulls back.
         limit_strength: [m/rad].
         hinges: joint name -> axis in the world of the T-pose; the joint turns about it alone. ``HINGES`` has
@@ -79,6 +80,7 @@ class PosePriors:
     untwisted: Mapping[str, tuple[tuple[float, float, float], float]] = field(
         default_factory=lambda: UNTWISTED
     )
+    untwist: float = 1.0
     limits: Mapping[str, float] = field(default_factory=dict)
     limit_strength: float = 0.05
     hinges: Mapping[str, tuple[float, float, float]] = field(default_factory=dict)
@@ -199,8 +201,12 @@ def twist_doubt(
     """Doubt of the joints among `names` that are no hinges; None where there are none.
 
     Raises:
-        InputError: an axis of no length, a negative doubt.
+        InputError: an axis of no length, a negative doubt or factor.
     """
+    if not priors.untwist >= 0:
+        raise InputError(
+            "priors.untwist", got=priors.untwist, expected="at least 0", fix="Use 1, or 0 for none."
+        )
     rows = []
     for name, (axis, doubt) in priors.untwisted.items():
         length = float(np.linalg.norm(axis))
@@ -208,6 +214,7 @@ def twist_doubt(
             where = f"priors.untwisted[{name!r}]"
             expected = "an axis of some length, and a doubt of at least 0"
             raise InputError(where, got=(tuple(axis), doubt), expected=expected, fix="See UNTWISTED.")
+        doubt *= priors.untwist
         if doubt and name in names and name not in priors.hinges:
             rows.append((names.index(name), np.asarray(axis) / length, doubt**2))
     if not rows:

@@ -26,7 +26,9 @@ class InversionResult:
             Its rotations are identity, and no other frame is affected.
         determined: (frames, J - 1) bool; whether the target determines the joint's rotation. False for joints
             without skin weight, without weighted vertices, or whose vertices have collapsed to a point.
-        converged: (frames,) bool; the last accepted step no longer lowered the energy noticeably.
+        converged: (frames,) bool; a Newton step under the model that was fitted would change the frame by
+            less than a hundredth or so of the error that is left; under plain skinning, the last step no
+            longer lowered the energy noticeably.
         iterations: (frames,) int, accepted steps.
         residual: root mean square of the weighted vertex error [m], (frames,); NaN where not valid.
         angle_std: standard deviation of each joint's own rotation, (frames, J - 1) [degrees]: root mean

@@ -120,7 +120,7 @@ class NativeFit:
 
         Returns:
             Rotations, translation and vertices carry gradients by `vertices` (the implicit derivative of the
-            minimum: exact where the fit is, Gauss-Newton elsewhere); the report does not.
+            minimum, with the model's exact curvature); the report does not.
 
         Raises:
             InputError: a wrong shape, a negative weight, or parameters of several bodies.
