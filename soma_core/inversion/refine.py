@@ -146,6 +146,7 @@ class Refinement:
         self, solve: Callable[[Tensor], Tensor], rows: Tensor, pose: Pose, view: View, damping: Tensor
     ) -> Callable[[Tensor], Tensor]:
         """`solve` with the matrix of some frames made anew; the others' steps stay what they are."""
+        rows = self.problem.several(rows)
         bound, typical, weight = (
             None if one is None else one[rows] for one in (self.bound, self.typical, self.weight)
         )

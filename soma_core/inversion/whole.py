@@ -179,7 +179,7 @@ class WholeFit:
                 pose if every else pose.part(rows), iterations=steps, tolerance=_RESTING, share=_RESTING_SHARE
             )
             pose = found if every else pose.put(rows, found)
-            rows = rows[found.last_change > 0]
+            rows = problem.several(torch.unique(rows[found.last_change > 0]))
         return pose
 
     def _searched(self, problem: Problem, pose: Pose) -> Pose:
@@ -195,6 +195,7 @@ class WholeFit:
         for tried in _TRIED:
             if not len(rows):
                 break
+            rows = problem.several(rows)
             many = rows.repeat(len(tried))
             part, old = problem.part(many), pose.part(many)
             relative = old.relative.clone()

@@ -150,7 +150,10 @@ def test_the_matrix_is_the_second_derivative_of_what_is_fitted(full, identity, t
     eye = torch.eye(3).double().expand(FRAMES, 1, 3, 3)
     turns = axis_angle_to_matrix(0.25 * randn(FRAMES, 77, 3, seed=1))
     pose = Pose.begin(torch.cat((eye, turns), 1), 0.3 * randn(FRAMES, 3, seed=2) - problem.origin)
-    system, refinement = _System.at(model, problem, pose), Refinement(model, problem)
+    refinement = Refinement(model, problem)
+    refinement._first_view(pose)  # settles how much the doubt weighs
+    problem = replace(problem, doubt=refinement.doubt)
+    system = _System.at(model, problem, pose)
     step = randn(*system.slope.shape, seed=7)
 
     def energy(length):
