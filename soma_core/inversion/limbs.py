@@ -40,7 +40,7 @@ _CLEAR = 0.08
 _DEAR = 5e-4
 """What it costs a share to come closer, as a root mean square error [m]."""
 
-_SHARES = 17
+_SHARES = 25
 """Shares looked at, evenly over a whole turn."""
 
 

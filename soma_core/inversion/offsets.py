@@ -27,10 +27,6 @@ from soma_core.rig.skeleton import Rig
 
 __all__ = ["PoseOffsets"]
 
-_HEARD = 0.03
-"""Activations that a joint's turn moves vertices through by less, relative to the most, are not looked at when a
-limb's twist is shared."""
-
 _FILLED = 0.1
 """Share of entries from which shapes are no longer treated as sparse."""
 
@@ -158,11 +154,8 @@ class PoseOffsets(torch.nn.Module):
         for which, joint in enumerate((own, end)):
             block, place = torch.nonzero(self.reads == joint, as_tuple=True)
             reads[self.taken[block].flatten(), which] = self.gate[block, :, place].flatten(0, 1)
-        every = _matrix(self.shapes).tocsc()
-        size = np.sqrt(np.asarray(every.multiply(every).sum(0)).ravel())
-        heard = reads[:-1].flatten(1).norm(dim=1).cpu().numpy() * size
-        ids = torch.as_tensor(np.flatnonzero(heard > _HEARD * heard.max())).to(reads.device)
-        shapes = every[:, ids.cpu().numpy()]
+        ids = torch.nonzero((reads[:-1] != 0).any(-1).any(-1)).flatten()
+        shapes = _matrix(self.shapes)[:, ids.cpu().numpy()]
         counted = scipy.sparse.diags_array(np.repeat(fitted.astype(np.float64), 3)) @ shapes
         values, vectors = np.linalg.eigh((shapes.T @ counted).toarray())
         kept = values > fitted.sum() * _LEAST_MODE**2
