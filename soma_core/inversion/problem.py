@@ -41,7 +41,7 @@ class Problem:
     doubt: TwistDoubt | None = None
 
     def several(self, rows: Tensor) -> Tensor:
-        """The rows; a single one twice where frames have bodies of their own, since one alone is treated apart."""
+        """The rows; a single one twice where frames have bodies of their own: one alone is treated apart."""
         return rows.repeat(2) if len(rows) == 1 and self.rest.batch_size > 1 else rows
 
     def part(self, rows: Tensor) -> Problem:
