@@ -11,7 +11,7 @@ from torch import Tensor
 
 from soma_core.errors import InputError
 from soma_core.geometry.kabsch import rotation_from_covariance
-from soma_core.geometry.rotations import axis_angle_to_matrix, matrix_to_quaternion
+from soma_core.geometry.rotations import axis_angle_to_matrix
 
 __all__ = [
     "HINGES",
@@ -185,14 +185,17 @@ class TwistDoubt:
         )
 
     def _twist(self, rotations: Tensor) -> tuple[Tensor, Tensor]:
-        """Angles (F, q) and their gradients (F, q, 3) by a turn on the left."""
-        quaternion = matrix_to_quaternion(rotations[:, self.variable])
-        real, vector = quaternion[..., :1], quaternion[..., 1:]
+        """Angles (F, q) and their gradients (F, q, 3) by a turn on the left.
+
+        With the quaternion (w, v), ``4 w^2`` and ``4 w v`` are read from the matrix.
+        """
+        rotation = rotations[:, self.variable]
+        real = (1 + rotation.diagonal(dim1=-2, dim2=-1).sum(-1, keepdim=True)).clamp_min(1e-6)
+        vector = _vee(rotation)
         along = (vector * self.axis).sum(-1, keepdim=True)
         across = torch.linalg.cross(vector, self.axis.expand_as(vector), dim=-1)
         slope = real * (real * self.axis + across) + along * vector
-        square = (real * real + along * along).clamp_min(1e-6)
-        return 2 * torch.atan2(along, real).squeeze(-1), slope / square
+        return 2 * torch.atan(along / real).squeeze(-1), slope / (real * real + along * along)
 
 
 def twist_doubt(
