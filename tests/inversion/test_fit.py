@@ -271,7 +271,8 @@ def test_the_kinds_of_kernels_agree(layer, targets, identity, result, fitted):
     found = PoseInversion(layer, kernels="torch")(targets, identity)
     gap = reconstructed(layer, identity, found) - reconstructed(layer, identity, result)
     assert gap[:, fitted].abs().max() < SEPARATE_M
-    assert torch.equal(found.iterations, result.iterations)
+    # A step whose gain is near the tolerance may be the last for one order of summing and not for another.
+    assert (found.iterations - result.iterations).abs().max() <= 1
     torch.testing.assert_close(found.vertex_error, result.vertex_error, atol=SEPARATE_M, rtol=0)
 
 
