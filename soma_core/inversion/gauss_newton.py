@@ -23,7 +23,7 @@ from soma_core.inversion.structure import MomentStructure
 if TYPE_CHECKING:
     from soma_core.kernels.pose_solver_wp import PoseSolver, Soft
 
-__all__ = ["HINGE_STIFFNESS", "GaussNewton", "damped_inverse"]
+__all__ = ["HINGE_STIFFNESS", "LONGEST_STEP", "GaussNewton", "damped_inverse"]
 
 _START_DAMPING = 1e-4
 _LOWER, _RAISE, _MOST_DAMPING = 0.2, 8.0, 1e6
@@ -38,7 +38,7 @@ _RIDGE = 1e-9
 HINGE_STIFFNESS = 1e3
 """Stiffness of a hinge across its axis, relative to what the vertices have to say of the joint."""
 
-_LONGEST_STEP = 1.0
+LONGEST_STEP = 1.0
 """A joint turns by at most this angle [rad] in one step."""
 
 
@@ -180,7 +180,7 @@ class GaussNewton(SkinEquations):
             self.constants(rest), target, start.relative, start.translation, tolerance**2 * mass, mass,
             forced=forced, iterations=iterations,
             damping=(_START_DAMPING, _LOWER, _RAISE, self._least_damping, _MOST_DAMPING),
-            longest=_LONGEST_STEP, stiffness=HINGE_STIFFNESS, soft=self.soft(terms, target),
+            longest=LONGEST_STEP, stiffness=HINGE_STIFFNESS, soft=self.soft(terms, target),
         )  # fmt: skip
         return Pose(
             relative=relative,
@@ -206,11 +206,15 @@ class GaussNewton(SkinEquations):
             return Soft(index, like.new_zeros(1), none, hinged=False)
         hinges = torch.nn.functional.pad(terms.hinge_axis.flip(0), (0, 0, whole - count, 0))
         return Soft(
-            columns=(whole - 1 - terms.variable).to(torch.int32),
+            columns=self.columns(terms.variable),
             numbers=torch.cat((terms.stiffness, terms.free, hinges.flatten())).contiguous(),
             reference=terms.reference.expand(len(like), -1, 3, 3),
             hinged=bool((terms.hinge_axis != 0).any()),
         )
+
+    def columns(self, variable: Tensor) -> Tensor:
+        """Columns of variables in the kernels, int32."""
+        return (len(self.movable) - 1 - variable).to(torch.int32)
 
     @property
     def _least_damping(self) -> float:
@@ -219,7 +223,7 @@ class GaussNewton(SkinEquations):
     def shortened(self, step: Tensor, turns: Tensor, terms: JointTerms | None) -> Tensor:
         """The step with no joint turned too far, and hinges kept to their axis where `terms` are given."""
         length = step[:, :-1].norm(dim=-1, keepdim=True)
-        short = torch.clamp(_LONGEST_STEP / length.clamp_min(1e-12), max=1)
+        short = torch.clamp(LONGEST_STEP / length.clamp_min(1e-12), max=1)
         step = torch.cat((step[:, :-1] * short, step[:, -1:]), 1)
         return step if terms is None else self._along_hinges(step, turns, terms)
 

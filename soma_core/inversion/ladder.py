@@ -96,6 +96,7 @@ class Targets:
         terms: soft terms and hinges; None without.
         doubt: of the joints' twists, under the full model; None without.
         rest: moments of the one identity by model, where there is one.
+        problems: those already made, by model.
     """
 
     vertices: Tensor
@@ -105,13 +106,16 @@ class Targets:
     terms: JointTerms | None
     doubt: TwistDoubt | None
     rest: dict[PoseModel, RestMoments]
+    problems: dict[PoseModel, Problem] = field(default_factory=dict)
 
     def problem(self, model: PoseModel) -> Problem:
         """The problem for one model."""
-        problem = model.problem(
-            self.vertices, self.identity, self.weights, self.bone_scale, self.terms, self.rest.get(model)
-        )
-        return replace(problem, doubt=self.doubt)
+        if model not in self.problems:
+            problem = model.problem(
+                self.vertices, self.identity, self.weights, self.bone_scale, self.terms, self.rest.get(model)
+            )
+            self.problems[model] = replace(problem, doubt=self.doubt)
+        return self.problems[model]
 
 
 class Ladder(torch.nn.Module):

@@ -40,8 +40,8 @@ _CLEAR = 0.08
 _DEAR = 5e-4
 """What it costs a share to come closer, as a root mean square error [m]."""
 
-_SHARES = 25
-"""Shares looked at, evenly over a whole turn."""
+_SHARES, _SHARES_NEAR = 25, 9
+"""Shares looked at, evenly over a whole turn, and of these those about what a search found before."""
 
 
 class LimbStart(torch.nn.Module):
@@ -202,6 +202,8 @@ class TwistShare:
         scale: Tensor,
         variables: Tensor,
         held: Collection[int] = (),
+        *,
+        near: bool = False,
     ) -> Pose:
         """The pose with the best share of every limb, as far as moments tell.
 
@@ -211,10 +213,13 @@ class TwistShare:
             scale: (F,) size of the bodies.
             variables: (n,) joints that may turn.
             held: joints that cannot turn so; limbs with such stay as they are.
+            near: look only about what the pose has.
         """
         rest, doubt = problem.rest, problem.doubt
         relative = pose.relative.clone()
         angle = torch.linspace(-math.pi, math.pi, _SHARES).to(relative)
+        if near:
+            angle = angle[(_SHARES - _SHARES_NEAR) // 2 :][:_SHARES_NEAR]
         for limb in self.free(held):
             energy = self._skin(limb, angle, view, rest) + self._moves(
                 limb, angle, pose.relative, view, scale

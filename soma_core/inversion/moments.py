@@ -12,7 +12,7 @@ world at T-pose, so that ``D_t`` is the joint's turn from the T-pose and no join
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 import torch
@@ -39,6 +39,9 @@ class RestMoments:
         second: ``N`` of every pair of joints that share vertices, (i, p, 4, 4).
         offsets: bone vectors in T-pose world axes, (i, J, 3) [m]; the Hips' entry is not used.
         driven: what joints that follow from the others are read with; None without such joints.
+        bind: from the bind pose to each joint's own axes in the T-pose's world, (i, J, 3, 4): the turn, and
+            in the last column the joint's place [m]; None where no model asks.
+        memo: what was made of the rest, with what it was made of.
     """
 
     local: Tensor
@@ -47,6 +50,8 @@ class RestMoments:
     second: Tensor
     offsets: Tensor
     driven: DrivenRest | None = None
+    bind: Tensor | None = None
+    memo: dict[object, tuple] = field(default_factory=dict, repr=False)
 
     @property
     def batch_size(self) -> int:

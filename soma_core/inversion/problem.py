@@ -128,15 +128,15 @@ class View:
     Attributes:
         energy: (F,) [m^2].
         slope: half its derivative (F, n + 1, 3) by turns in world axes, and by the translation.
-        residual: ``P`` (F, T, 3, 4), moments of what is left.
-        pull: half the derivative (F, C) by the activations; None without offsets.
+        residual: ``P`` (F, T, 3, 4), moments of what is left; None where no longer asked for.
+        pull: half the derivative (F, C) by the activations; None likewise, and without offsets.
         turns, places: of all joints, (F, J, 3, 3) and (F, J, 3).
         activity: of the offsets; None without.
     """
 
     energy: Tensor
     slope: Tensor
-    residual: Tensor
+    residual: Tensor | None
     pull: Tensor | None
     turns: Tensor
     places: Tensor

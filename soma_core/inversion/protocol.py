@@ -8,6 +8,7 @@ from typing import Protocol
 from torch import Tensor
 
 from soma_core.inversion.gauss_newton import GaussNewton
+from soma_core.inversion.priors import TwistDoubt
 from soma_core.inversion.problem import Pose, Problem, View
 
 __all__ = ["Curvature", "ForwardModel"]
@@ -65,6 +66,13 @@ class ForwardModel(Protocol):
             damping: (F,) relative to the diagonal.
             mass: (F,) sums of the vertex weights.
         """
+
+    def doubted(self, doubt: TwistDoubt, relative: Tensor, turns: Tensor) -> tuple[Tensor, Tensor]:
+        """A doubt's share (F,) and half its derivative (F, n + 1, 3) at local rotations and world turns."""
+        ...
+
+    def moved(self, problem: Problem, pose: Pose, turns: Tensor, step: Tensor) -> Pose:
+        """Poses after a step (F, n + 1, 3); `turns` are the world turns of the joints before it."""
 
     def curvature(self, problem: Problem, pose: Pose) -> Curvature:
         """The exact curvature at poses."""

@@ -27,8 +27,12 @@ _LOWER, _RAISE, _LEAST_RAISED, _MOST_DAMPING = 0.1, 10.0, 1e-4, 1e4
 """Levenberg damping relative to the diagonal: start, factors after a good and a bad step, least value after a
 bad one, largest."""
 
-_FACTORISED = (0, 1, 3, 5)
-"""Steps at which the matrix is made anew; in between, the memory makes up for what changes."""
+_EARLY, _EVERY = (0, 1, 3, 5), (5, 3)
+"""Steps at which the matrix is made anew: the first ones, and those that leave the second of these numbers when
+divided by the first. In between, the memory makes up for what changes."""
+
+_CROWDED = 0.75
+"""Share of frames that still move from which those that rest are carried along."""
 
 _NOISE = {torch.float32: 1e-6, torch.float64: 1e-14}
 """Relative rounding of an energy."""
@@ -51,22 +55,25 @@ class _Memory:
         kept = better[:, None, None]  # what led to a refused step is not asked again
         return _Memory(steps=torch.where(kept, steps, 0.0), changes=torch.where(kept, changes, 0.0))
 
+    def part(self, rows: Tensor) -> _Memory:
+        return _Memory(steps=self.steps[rows], changes=self.changes[rows])
+
     def direction(self, slope: Tensor, solve: Callable[[Tensor], Tensor]) -> Tensor:
-        """Approximate inverse of the matrix times `slope` (F, d)."""
+        """Approximate inverse of the matrix times `slope` (F, n + 1, 3)."""
         product = (self.steps * self.changes).sum(-1)
         length = self.steps.norm(dim=-1) * self.changes.norm(dim=-1)
         known = product > 1e-6 * length
         inverse = torch.where(known, 1 / product.where(known, torch.ones_like(product)), 0.0)
-        used, left = [], slope
+        used, left = [], slope.flatten(1)
         for i in reversed(range(self.steps.shape[1])):
             share = inverse[:, i] * (self.steps[:, i] * left).sum(-1)
             used.append(share)
             left = left - share[:, None] * self.changes[:, i]
-        found = solve(left)
+        found = solve(left.view_as(slope)).flatten(1)
         for i, share in enumerate(reversed(used)):
             back = inverse[:, i] * (self.changes[:, i] * found).sum(-1)
             found = found + (share - back)[:, None] * self.steps[:, i]
-        return found
+        return found.view_as(slope)
 
 
 class Refinement:
@@ -101,32 +108,40 @@ class Refinement:
                 is below this [m],
             share: or below this share of the error that is left.
         """
-        solver = self.model.solver
-        pose, view = start, self._first_view(start)
+        solver, here, pose, out = self.model.solver, self, start, start
+        view = self._first_view(start)
+        rows = torch.arange(len(self.mass), device=self.mass.device)
+        moving = torch.ones_like(rows, dtype=torch.bool)
         damping = torch.full_like(self.mass, _START_DAMPING)
-        moving = torch.ones_like(start.accepted, dtype=torch.bool)
-        shape = view.slope.shape
-        none = view.slope.new_zeros(shape[0], 0, shape[1] * shape[2])
-        memory = _Memory(steps=none, changes=none)
-        floor = _FLOOR[self.mass.dtype] ** 2 * self.mass
-        solve = None
+        none = view.slope.flatten(1)[:, None][:, :0]
+        memory, solve = _Memory(steps=none, changes=none), None
         for count in range(iterations + 1):
-            if solve is None or count in _FACTORISED:
-                solve = self._inverse(pose, view, damping)
-            step = -memory.direction(
-                view.slope.flatten(1), lambda one, to=solve: to(one.view(shape)).flatten(1)
-            )
-            step = solver.shortened(step.view(shape), view.turns, self.problem.terms)
-            decrement = (-(step * view.slope).sum((1, 2)).clamp_max(0) / self.mass).sqrt()
-            enough = torch.clamp((view.energy / self.mass).sqrt() * share, min=tolerance)
+            if solve is None or _renewed(count):
+                solve = here._inverse(pose, view, damping)
+            step = memory.direction(view.slope, solve)
+            step = solver.shortened(-step, view.turns, here.problem.terms)
+            decrement = (-(step * view.slope).sum((1, 2)).clamp_max(0) / here.mass).sqrt()
+            enough = torch.clamp((view.energy / here.mass).sqrt() * share, min=tolerance)
             moving = moving & ~(decrement < enough)
             last = torch.where(moving, decrement, torch.zeros_like(decrement))
             pose = replace(pose, last_change=last)
-            if count == iterations or not bool(moving.any()):
+            left = int(moving.sum())
+            if count == iterations or not left:
                 break
-            trial = solver.retract(pose, view.turns, step)
-            seen = self._view(trial)
-            better = moving & (seen.energy < view.energy * (1 + _NOISE[self.mass.dtype]) + floor)
+            if left <= _CROWDED * len(rows):
+                out, kept = out.put(rows, pose), self.problem.several(torch.nonzero(moving).flatten())
+                solve = _narrowed(solve, kept, len(rows))
+                here, pose, view, memory = (
+                    here.part(kept),
+                    pose.part(kept),
+                    _part(view, kept),
+                    memory.part(kept),
+                )
+                rows, moving, damping, step = (one[kept] for one in (rows, moving, damping, step))
+            trial = here.model.moved(here.problem, pose, view.turns, step)
+            seen = here._view(trial)
+            floor = _FLOOR[here.mass.dtype] ** 2 * here.mass
+            better = moving & (seen.energy < view.energy * (1 + _NOISE[here.mass.dtype]) + floor)
             memory = memory.after(step.flatten(1), (seen.slope - view.slope).flatten(1), better)
             pose = Pose(
                 relative=_chosen(better, trial.relative, pose.relative),
@@ -138,22 +153,25 @@ class Refinement:
             lower, higher = damping * _LOWER, (damping * _RAISE).clamp(_LEAST_RAISED, _MOST_DAMPING)
             damping = torch.where(better, lower, higher)
             refused = torch.nonzero(moving & ~better).flatten()
-            if len(refused):
-                solve = self._again(solve, refused, pose, view, damping)
-        return pose
+            if len(refused) and not _renewed(count + 1):
+                solve = here._again(solve, refused, pose, view, damping)
+        return out.put(rows, pose)
+
+    def part(self, rows: Tensor) -> Refinement:
+        """The same of some frames, where their doubt of twists is settled."""
+        bound, typical = (None if one is None else one[rows] for one in (self.bound, self.typical))
+        few = Refinement(self.model, self.problem.part(rows), bound, typical)
+        if self.weight is not None and few.problem.doubt is not None:
+            few.weight = self.weight[rows]
+            few.doubt = few.problem.doubt.weighed(few.weight)
+        return few
 
     def _again(
         self, solve: Callable[[Tensor], Tensor], rows: Tensor, pose: Pose, view: View, damping: Tensor
     ) -> Callable[[Tensor], Tensor]:
         """`solve` with the matrix of some frames made anew; the others' steps stay what they are."""
         rows = self.problem.several(rows)
-        bound, typical, weight = (
-            None if one is None else one[rows] for one in (self.bound, self.typical, self.weight)
-        )
-        few = Refinement(self.model, self.problem.part(rows), bound, typical)
-        if few.problem.doubt is not None and weight is not None:
-            few.weight, few.doubt = weight, few.problem.doubt.weighed(weight)
-        new = few._inverse(pose.part(rows), _part(view, rows), damping[rows])
+        new = self.part(rows)._inverse(pose.part(rows), _part(view, rows), damping[rows])
         return lambda slope: solve(slope).index_copy(0, rows, new(slope[rows]))
 
     def _first_view(self, pose: Pose) -> View:
@@ -168,22 +186,23 @@ class Refinement:
         return self._with_priors(self.model.view(self.problem, pose, self.bound), pose)
 
     def _with_priors(self, view: View, pose: Pose) -> View:
+        """The view with priors, and without what a descent does not look at."""
+        activity = None if view.activity is None else replace(view.activity, before=None)
+        view = replace(view, residual=None, pull=None, activity=activity)
         if self.problem.terms is not None:
             view = self._with_terms(view, pose, self.problem.terms, self.mass)
         return view if self.doubt is None else self._doubted(view, pose, self.doubt)
 
     def _doubted(self, view: View, pose: Pose, doubt: TwistDoubt) -> View:
         """The error E as ``E (1 + S)``, and its slope over ``1 + S``: as long as that of E alone."""
-        n = self.model.solver.variables
-        rotations, more = pose.relative[:, n], 1 + doubt.share(pose.relative[:, n])
-        slope = view.slope.clone()
-        own = doubt.slope(rotations, view.turns[:, self.model.solver.parents[n]])
+        share, own = self.model.doubted(doubt, pose.relative, view.turns)
         if self.typical is not None:
             weight = self.mass * self.typical.square()
-            slope[:, : len(n)] += weight[:, None, None] * own
-            return replace(view, slope=slope, energy=view.energy + weight * (more - 1))
-        slope[:, : len(n)] += (view.energy / more)[:, None, None] * own
-        return replace(view, slope=slope, energy=view.energy * more)
+            return replace(
+                view, slope=view.slope + weight[:, None, None] * own, energy=view.energy + weight * share
+            )
+        slope = view.slope + (view.energy / (1 + share))[:, None, None] * own
+        return replace(view, slope=slope, energy=view.energy * (1 + share))
 
     def _with_terms(self, view: View, pose: Pose, terms: JointTerms, mass: Tensor) -> View:
         slope, n = view.slope.clone(), self.model.solver.variables
@@ -204,6 +223,20 @@ class Refinement:
                 left = self.mass * self.typical.square()
             mass = self.weight * left
         return self.model.inverse(problem, pose, view, damping, mass)
+
+
+def _renewed(count: int) -> bool:
+    """Whether the matrix is made anew at a step."""
+    return count in _EARLY or count % _EVERY[0] == _EVERY[1]
+
+
+def _narrowed(solve: Callable[[Tensor], Tensor], rows: Tensor, count: int) -> Callable[[Tensor], Tensor]:
+    """What solves for `count` frames, of some of them alone."""
+
+    def few(slope: Tensor) -> Tensor:
+        return solve(slope.new_zeros(count, *slope.shape[1:]).index_copy_(0, rows, slope))[rows]
+
+    return few
 
 
 def _part(view: View, rows: Tensor) -> View:

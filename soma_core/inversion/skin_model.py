@@ -15,15 +15,16 @@ from soma_core.animation.engine import Animation
 from soma_core.geometry.sparse import SparseRows
 from soma_core.inversion.curvature import SkinCurvature, in_float64
 from soma_core.inversion.driven import DrivenJoints
-from soma_core.inversion.gauss_newton import HINGE_STIFFNESS, GaussNewton, damped_inverse
+from soma_core.inversion.gauss_newton import HINGE_STIFFNESS, LONGEST_STEP, GaussNewton, damped_inverse
 from soma_core.inversion.limbs import LimbStart
 from soma_core.inversion.moments import RestMoments, SkinMoments
 from soma_core.inversion.offsets import PoseOffsets
+from soma_core.inversion.priors import TwistDoubt
 from soma_core.inversion.problem import Activity, Pose, Problem, View
 from soma_core.inversion.start import ProcrustesStart
 from soma_core.inversion.structure import MomentStructure
 from soma_core.inversion.tables import solver_tables
-from soma_core.kernels.model_residual import ModelResidual
+from soma_core.kernels.model_residual import ModelResidual, Residual
 from soma_core.rig.skeleton import Rig
 from soma_core.skeleton.identity import Identity
 
@@ -163,6 +164,9 @@ class SkinModel(torch.nn.Module):
         return identity if self.driven is None else self.driven.extended(identity)
 
     def _with_driven(self, rest: RestMoments, identity: Identity) -> RestMoments:
+        bind = self._whole(identity).bind_world
+        turn = self.orient @ bind[..., :3, :3].mT
+        rest = replace(rest, bind=torch.cat((turn, bind[..., :3, 3:]), -1))
         if self.driven is None:
             return rest
         return replace(rest, driven=self.driven.rest(identity.bind_world))
@@ -175,28 +179,62 @@ class SkinModel(torch.nn.Module):
             pose: about the problem's origin.
             bound: residuals beyond it count linearly, (F,) [m]; None counts all squared.
         """
-        turns, places = self.walk(pose, problem.rest)
-        activity = None if self.offsets is None else self.offsets.activity(pose.relative)
-        found = self.residual(*self.posing(problem, turns, places, activity), bound)
+        turns, places, activity, given = self._posed(problem, pose)
+        found = self.residual(*given, bound)
         assert found.forces is not None
-        bind = self._whole(problem.identity).bind_world[:, self.moments.joints]
-        turn = self.orient[self.moments.joints] @ bind[..., :3, :3].mT
-        forces = found.forces[:, self.moments.joints]
-        about = forces[..., :3] - forces[..., 3:] * bind[..., None, :3, 3]
-        residual = torch.cat((about @ turn.mT, forces[..., 3:]), -1)
-        if self._steps is None:
-            slope = self.solver.slopes(turns, places, problem.rest, residual)
-        else:
-            constants = self._constants(problem.rest)
-            slope = self._steps.slopes(constants, pose.relative, pose.translation, residual)
-        if self.offsets is not None and activity is not None and found.pull is not None:
-            above = turns[:, self.solver.parents[: self.solver.public_count]]
-            more = self.offsets.slopes(found.pull, activity, pose.relative, above)[:, self.solver.variables]
-            slope = slope + torch.nn.functional.pad(more, (0, 0, 0, 1))
+        slope, residual = self._slopes(problem, pose, turns, places, activity, found)
         return View(
             energy=found.energy, slope=slope, residual=residual, pull=found.pull, turns=turns, places=places,
             activity=activity,
         )  # fmt: skip
+
+    def _slopes(
+        self,
+        problem: Problem,
+        pose: Pose,
+        turns: Tensor,
+        places: Tensor,
+        activity: Activity | None,
+        found: Residual,
+    ) -> tuple[Tensor, Tensor]:
+        """Half the slope (F, n + 1, 3) of the error, and ``P`` (F, T, 3, 4)."""
+        rest, joints = problem.rest, self.moments.joints
+        assert found.forces is not None
+        assert rest.bind is not None
+        if self._steps is not None:
+            rising = None if activity is None else _rising(activity)
+            return self._steps.slopes(
+                self._constants(rest), pose.relative, pose.translation, found.forces, found.pull, rising
+            )
+        bind, forces = rest.bind[:, joints], found.forces[:, joints]
+        about = forces[..., :3] - forces[..., 3:] * bind[..., None, :, 3]
+        residual = torch.cat((about @ bind[..., :3].mT, forces[..., 3:]), -1)
+        slope = self.solver.slopes(turns, places, rest, residual)
+        if self.offsets is not None and activity is not None and found.pull is not None:
+            above = turns[:, self.solver.parents[: self.solver.public_count]]
+            more = self.offsets.slopes(found.pull, activity, pose.relative, above)[:, self.solver.variables]
+            slope = slope + torch.nn.functional.pad(more, (0, 0, 0, 1))
+        return slope, residual
+
+    def doubted(self, doubt: TwistDoubt, relative: Tensor, turns: Tensor) -> tuple[Tensor, Tensor]:
+        """A doubt's share (F,) and half its derivative (F, n + 1, 3) at local rotations and world turns."""
+        n = self.solver.variables
+        if self._steps is None:
+            rotations = relative[:, n]
+            slope = doubt.slope(rotations, turns[:, self.solver.parents[n]])
+            return doubt.share(rotations), torch.nn.functional.pad(slope, (0, 0, 0, 1))
+        columns = self.solver.columns(doubt.variable)
+        return self._steps.doubted(relative, turns, columns, doubt.axis, doubt.square.view(-1, len(columns)))
+
+    def moved(self, problem: Problem, pose: Pose, turns: Tensor, step: Tensor) -> Pose:
+        """Poses after a step (F, n + 1, 3) of :meth:`inverse`; `turns` are the world's before it."""
+        if self._steps is None:
+            return self.solver.retract(pose, turns, step)
+        constants = self._constants(problem.rest)
+        relative, hips = self._steps.moved(
+            constants, pose.relative, pose.translation, step, longest=LONGEST_STEP
+        )
+        return replace(pose, relative=relative, translation=hips)
 
     def walk(self, pose: Pose, rest: RestMoments) -> tuple[Tensor, Tensor]:
         """World turns (F, J', 3, 3) and places (F, J', 3) of all joints, twist joints too."""
@@ -208,26 +246,46 @@ class SkinModel(torch.nn.Module):
         self, problem: Problem, pose: Pose, *, energy_only: bool = False
     ) -> tuple[Tensor | None, Tensor]:
         """Vertex errors (F, v) [m] of poses, and the weighted sum of their squares (F,) [m^2]."""
-        turns, places = self.walk(pose, problem.rest)
-        activity = None if self.offsets is None else self.offsets.activity(pose.relative)
-        given = self.posing(problem, turns, places, activity)
+        given = self._posed(problem, pose)[-1]
         found = self.residual(*given, gradient=False, distances=not energy_only)
         return found.distances, found.energy
+
+    def _posed(
+        self, problem: Problem, pose: Pose
+    ) -> tuple[Tensor, Tensor, Activity | None, tuple[Tensor | None, ...]]:
+        """Turns and places of all joints, activations, and what :class:`ModelResidual` takes."""
+        if self._steps is None:
+            turns, places = self.solver.walk(pose, problem.rest)
+            activity = None if self.offsets is None else self.offsets.activity(pose.relative)
+            return turns, places, activity, self.posing(problem, turns, places, activity)
+        constants = self._constants(problem.rest)
+        turns, places, transforms, value, before, rising = self._steps.posed(
+            constants, pose.relative, pose.translation
+        )
+        activity = None
+        if self.offsets is not None:
+            activity = Activity(value=value)
+            if self.offsets.first is not None:
+                activity = Activity(value=value, before=before, slope=rising)
+        return turns, places, activity, self._given(problem, transforms, activity)
 
     def posing(
         self, problem: Problem, turns: Tensor, places: Tensor, activity: Activity | None
     ) -> tuple[Tensor, Tensor, Tensor, Tensor | None, Tensor | None, Tensor, Tensor]:
         """What :class:`ModelResidual` takes."""
-        identity = problem.identity
-        bind = self._whole(identity).bind_world
+        bind = self._whole(problem.identity).bind_world
         turn = turns @ (self.orient @ bind[..., :3, :3].mT)
         shift = places - (turn @ bind[..., :3, 3:]).squeeze(-1)
-        transforms = torch.cat((turn, shift[..., None]), -1)
+        return self._given(problem, torch.cat((turn, shift[..., None]), -1), activity)
+
+    def _given(
+        self, problem: Problem, transforms: Tensor, activity: Activity | None
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor | None, Tensor | None, Tensor, Tensor]:
         value = scale = None
         if activity is not None:
-            value, scale = activity.value, self.scale(problem).expand(len(turns))
+            value, scale = activity.value, self.scale(problem).expand(len(transforms))
         return (
-            identity.rest, problem.weights, transforms, value, scale, problem.vertices, problem.origin,
+            problem.identity.rest, problem.weights, transforms, value, scale, problem.vertices, problem.origin,
         )  # fmt: skip
 
     def inverse(
@@ -288,8 +346,7 @@ class SkinModel(torch.nn.Module):
         assert self._steps is not None
         slope = scale = None
         if activity is not None:
-            slope = torch.ones_like(activity.value) if activity.slope is None else activity.slope
-            scale = self.scale(problem).expand(len(mass))
+            slope, scale = _rising(activity), self.scale(problem).expand(len(mass))
         return self._steps.factorise(
             self._constants(problem.rest), pose.relative, pose.translation, damping, mass, slope, scale,
             stiffness=HINGE_STIFFNESS, soft=self.solver.soft(problem.terms, pose.translation),
@@ -297,7 +354,15 @@ class SkinModel(torch.nn.Module):
 
     def _constants(self, rest: RestMoments) -> tuple[Tensor, bool]:
         """What kernels take of identities."""
-        return self.solver.constants(rest, *(() if self.offsets is None else self.offsets.sizes(rest)))
+        made_of = (rest.second, rest.own, rest.offsets)
+        known = rest.memo.get(self)
+        if known is not None and all(one is two for one, two in zip(known[0], made_of, strict=True)):
+            return known[1]
+        assert rest.bind is not None
+        sizes = () if self.offsets is None else self.offsets.sizes(rest)
+        found = self.solver.constants(rest, rest.bind, *sizes)
+        rest.memo[self] = made_of, found
+        return found
 
     def _with_terms(
         self,
@@ -350,3 +415,8 @@ class SkinModel(torch.nn.Module):
     def scale(self, problem: Problem) -> Tensor:
         """Size of the bodies beside the canonical one, (1 or F,)."""
         return problem.origin.new_ones(1)
+
+
+def _rising(activity: Activity) -> Tensor:
+    """Slopes (F, C) of activations."""
+    return torch.ones_like(activity.value) if activity.slope is None else activity.slope

@@ -12,6 +12,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import scipy.sparse
 
 from soma_core.inversion.driven import DrivenJoints
 from soma_core.inversion.elimination import EliminationPlan, elimination_plan
@@ -20,7 +21,7 @@ from soma_core.inversion.structure import MomentStructure
 
 __all__ = ["SolverTables", "solver_tables"]
 
-_SMALL = 1e-3
+_SMALL = 1e-2
 """Relative to the largest: smaller products of modes, and moments on a joint's cloud, are left out."""
 
 _DIAGONAL, _BELOW, _TURNED = 0, 1, 2
@@ -209,7 +210,8 @@ class _Modes:
         reads = offsets.reads.cpu().numpy()
         self.columns = [[int(r) for r in row if r < joint_count] for row in reads]
         self.reads = [[j for j in row if j in free] for row in self.columns]
-        self.near = [[int(q) for q in np.flatnonzero(near[p])] for p in range(blocks)]
+        # Each pair of blocks once: what the other would add is what this one adds, transposed.
+        self.near = [[int(q) for q in np.flatnonzero(near[p]) if q >= p] for p in range(blocks)]
         self.clouds = [[int(t) for t in np.flatnonzero(touch[:, p])] for p in range(blocks)]
         self.trees = [self._tree(clouds) for clouds in self.clouds]
         self.rows = [self._rows(p) for p in range(blocks)]
@@ -260,10 +262,13 @@ class _Modes:
             **self._read_lists(slots, place, reads, used),
         }  # fmt: skip
         numbers = {**self._numbers(taken, used), "fold_value": _flat(folds, 4, float)}
+        seen, weighed = self._features(slots)
+        lists, numbers = {**lists, **seen}, {**numbers, **weighed}
         most = max(blocks, key=lambda p: size[p] * len(self.trees[p]))
         self.counts = {
             "block_count": len(blocks), "feature_columns": offsets.columns, "used_count": len(used),
-            "activation_count": activations,
+            "activation_count": activations, "feature_count": len(seen["feature_joint"]),
+            "squash": 0 if offsets.first is None else 1 + offsets.squash,
             "response_size": int(lists["response_start"][-1]),
             "mode_rows": max(s * 3 * (len(r) + 1) for s, r in zip(size, self.rows, strict=True)),
             "mode_tree": size[most] * 6 * len(self.trees[most]),
@@ -318,6 +323,34 @@ class _Modes:
             "used_joint": np.array(used),
         }  # fmt: skip
 
+    def _features(self, slots: _Slots) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
+        """How activations read the joints' features, and where the joints are among the columns."""
+        offsets = self.offsets
+        assert offsets is not None
+        width, count = 3 * offsets.columns, len(offsets.left)
+        if offsets.first is None:
+            rows = scipy.sparse.eye_array(width * count, format="csr")
+        else:
+            start, column, value = (part.cpu().numpy() for part in offsets.first.csr)
+            rows = scipy.sparse.csr_array((value.astype(np.float64), column, start), offsets.first.shape)
+        used = np.unique(rows.indices // width)
+        place = np.full(count, -1)
+        place[used] = np.arange(len(used))
+        left, right, still = (
+            part[used].double().cpu().numpy() for part in (offsets.left, offsets.right, offsets.still)
+        )
+        lists = {
+            "feature_joint": used,
+            "feature_column": np.array([slots.column.get(int(joint), -1) for joint in used]),
+            "weigh_start": rows.indptr,
+            "weigh_feature": width * place[rows.indices // width] + rows.indices % width,
+        }
+        numbers = {
+            "feature_left": left, "feature_right": right[..., : offsets.columns], "feature_still": still,
+            "weigh_value": rows.data,
+        }  # fmt: skip
+        return lists, numbers
+
     def _numbers(self, taken: Sequence[Sequence[int]], used: Sequence[int]) -> dict[str, np.ndarray]:
         """Of every block: how its activations read features, its modes, and their moments and products."""
         assert self.offsets is not None
@@ -332,7 +365,10 @@ class _Modes:
             "cloud_moment": _joined(
                 self.moments[t, :, :, p, : size[p]].transpose(2, 0, 1) for p in blocks for t in self.clouds[p]
             ),
-            "gram": _joined(self.gram[p, : size[p], q, : size[q]] for p in blocks for q in self.near[p]),
+            "gram": _joined(
+                (0.5 if p == q else 1.0) * self.gram[p, : size[p], q, : size[q]]
+                for p in blocks for q in self.near[p]
+            ),
             "left": left[used].ravel(),
             "right": right[used][..., : offsets.columns].ravel(),
         }

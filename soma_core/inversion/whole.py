@@ -29,9 +29,6 @@ _RESTING, _RESTING_SHARE = 1.5e-7, 5e-3
 """A frame rests where a Newton step would change it by less, as a root mean square of its vertices [m], or
 relative to the error that is left."""
 
-_BURST = 7
-"""Steps after which frames that rest are left alone."""
-
 _SAMPLED = 8
 """Every so many vertices have a say in a frame's median residual."""
 
@@ -98,7 +95,7 @@ class WholeFit:
         for done in range(rounds):
             if robust:
                 clip = self._clip(model, problem, pose)
-            pose = self._shared(problem, pose, clip)
+            pose = self._shared(problem, pose, clip, near=done > 0 and not robust)
             if done == rounds - 1 and not robust:
                 break
             view = model.view(problem, pose, None if clip is None else clip.bound)
@@ -108,7 +105,7 @@ class WholeFit:
             )  # fmt: skip
         return replace(pose, accepted=torch.zeros_like(pose.accepted)), clip
 
-    def _shared(self, problem: Problem, pose: Pose, clip: _Clip | None) -> Pose:
+    def _shared(self, problem: Problem, pose: Pose, clip: _Clip | None, *, near: bool) -> Pose:
         share = self.coarse.share
         if share is None:
             return pose
@@ -117,7 +114,8 @@ class WholeFit:
         weight = self.coarse.clumping(view, mass)
         view = replace(view, energy=weight * (view.energy if clip is None else mass * clip.typical.square()))
         scale = self.coarse.scale(problem).expand(len(pose.translation))
-        return share(pose, view, problem, scale, self.coarse.solver.variables, self._held(problem))
+        n = self.coarse.solver.variables
+        return share(pose, view, problem, scale, n, self._held(problem), near=near)
 
     def _kept(self, problem: Problem, pose: Pose) -> JointTerms | None:
         """Terms that keep the share of a limb's twist, which moments do not tell."""
@@ -162,25 +160,10 @@ class WholeFit:
         return _Clip(bound=(2 * typical).clamp_min(self.options.robust), typical=typical)
 
     def _descended(self, model: PoseModel, problem: Problem, pose: Pose, clip: _Clip | None) -> Pose:
-        """Descent on the model; frames that rest are left alone."""
-        rows = torch.arange(len(pose.accepted), device=pose.accepted.device)
-        pose = replace(pose, last_change=torch.full_like(pose.last_change, torch.inf))
-        done = 0
-        for steps in (_BURST, self.options.refreshes - _BURST):
-            steps = min(steps, self.options.refreshes - done)
-            if not len(rows) or steps <= 0:
-                break
-            done += steps
-            every = len(rows) == len(pose.accepted)
-            part = problem if every else problem.part(rows)
-            clips = () if clip is None else (clip.bound[rows], clip.typical[rows])
-            refinement = Refinement(model, part, *clips)
-            found = refinement(
-                pose if every else pose.part(rows), iterations=steps, tolerance=_RESTING, share=_RESTING_SHARE
-            )
-            pose = found if every else pose.put(rows, found)
-            rows = problem.several(torch.unique(rows[found.last_change > 0]))
-        return pose
+        """Descent on the model."""
+        clips = () if clip is None else clip
+        refinement = Refinement(model, problem, *clips)
+        return refinement(pose, iterations=self.options.refreshes, tolerance=_RESTING, share=_RESTING_SHARE)
 
     def _searched(self, problem: Problem, pose: Pose) -> Pose:
         """Frames that may rest beside their minimum are tried from other limb twists."""

@@ -220,7 +220,7 @@ MODES = (
         for (int e = near_start_mode[p]; e < near_start_mode[p+1]; e++) {
             int b = near_block[e], size_b = mode_size[b], seen = read_start[b+1] - read_start[b];
             for (int m = 0; m < size_p; m++) for (int l = 0; l < size_b; l++) {
-                V h = (R(0.5) * grams[m*size_b+l]) * most;
+                V h = grams[m*size_b+l] * most;
                     const V* x = response + response_start[b] + 3*l*seen;
                 for (int r = 0; r < seen; r++) {
                     V* o = y + 3 * (size_p * into[r] + m);

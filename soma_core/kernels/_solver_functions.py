@@ -8,6 +8,7 @@ import warp as wp
 from soma_core.kernels import _matrix_text as matrix
 from soma_core.kernels import _solver_text as text
 from soma_core.kernels import _variance_text as variance
+from soma_core.kernels import _view_text as view
 from soma_core.kernels._native import native
 from soma_core.kernels._solver_layout import COUNTS, KEPT, LISTS, NUMBERS, SLOTS
 
@@ -62,6 +63,21 @@ def solver_functions(scalar: str, lanes: int, *, shared: bool) -> SimpleNamespac
     ) -> int:  # fmt: skip
         return 0
 
+    def doubt(
+        plan: _ids, numbers: real, k: real, s: real, f: real, columns: _ids, spins: real, squares: real,
+        count: int,
+    ): ...  # fmt: skip
+
+    def keep(plan: _ids, numbers: real, k: real, s: real, f: real): ...
+
+    def transform(plan: _ids, numbers: real, k: real, s: real, f: real): ...
+
+    def activate(plan: _ids, numbers: real, k: real, s: real, f: real): ...
+
+    def pull(plan: _ids, numbers: real, k: real, s: real, f: real): ...
+
+    def turn(plan: _ids, numbers: real, k: real, s: real, f: real): ...
+
     def root_turn(plan: _ids, numbers: real, k: real, s: real, f: real, damping_start: number): ...
 
     bodies = {
@@ -70,6 +86,8 @@ def solver_functions(scalar: str, lanes: int, *, shared: bool) -> SimpleNamespac
         "forces": (text.FORCES, forces),
         "modes": (matrix.MODES, modes), "factor": (matrix.FACTOR, factor), "solve": (text.SOLVE, solve),
         "terms": (text.TERMS, terms), "move": (text.MOVE, move), "accept": (text.ACCEPT, accept),
+        "transform": (view.TRANSFORM, transform), "activate": (view.ACTIVATE, activate),
+        "keep": (view.KEEP, keep), "doubt": (view.DOUBT, doubt), "pull": (view.PULL, pull), "turn": (view.TURN, turn),
         "still": (text.STILL, root_turn), "selected": (variance.SELECTED, selected),
     }  # fmt: skip
     return SimpleNamespace(**{name: made(*given) for name, given in bodies.items()})

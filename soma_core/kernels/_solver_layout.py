@@ -7,7 +7,7 @@ __all__ = ["COUNTS", "EXTRA", "KEPT", "LISTS", "NUMBERS", "SLOTS", "slot_sizes"]
 COUNTS = (
     "joint_count", "all_count", "weighted_count", "pair_count", "column_count", "driven_count", "slot_count",
     "channel_count", "helper_count", "add_count", "twist_count", "chain_count", "twist_rows", "block_count",
-    "feature_columns", "used_count",
+    "feature_columns", "used_count", "feature_count", "activation_count", "squash",
 )  # fmt: skip
 LISTS = (
     "parents", "weighted", "pairs", "joint", "parent", "parent_column", "near_start", "near_joint",
@@ -20,13 +20,13 @@ LISTS = (
     "tree_start", "tree_joint", "tree_up", "tree_row", "cloud_start", "cloud_tree", "cloud_weighted",
     "fold_start", "fold_tree", "fold_helper", "fold_channel", "fold_row", "mode_row_count", "apply_start",
     "apply_row", "apply_read", "apply_block", "apply_kind", "near_start_mode", "near_block", "near_rows",
-    "used_joint",
+    "used_joint", "feature_joint", "feature_column", "weigh_start", "weigh_feature",
 )  # fmt: skip
 NUMBERS = (
     "mix_value", "drive_value", "cross_value", "spin_axis", "gate", "mode", "cloud_moment", "fold_value",
-    "gram", "left", "right",
+    "gram", "left", "right", "feature_left", "feature_right", "feature_still", "weigh_value",
 )  # fmt: skip
-EXTRA = ("activation_count", "response_size", "mode_rows", "mode_tree")
+EXTRA = ("response_size", "mode_rows", "mode_tree")
 """Further counts, of memory alone."""
 
 KEPT = ("blocks", "carry", "last", "inverse")
@@ -43,7 +43,9 @@ def slot_sizes(n: Mapping[str, int]) -> dict[str, int]:
         "spread": 9 * a, "force": 3 * a, "slope": 3 * c + 3, "twists": 3 * n["twist_rows"],
         "twist_force": 3 * k, "twist_pair": k * k, "helper_axis": 3 * n["helper_count"],
         "gained": 1, "damping": 1, "moving": 1, "accepted": 1, "last_change": 1, "threshold": 1, "mass": 1,
-        "soft_energy": 1, "scale": 1, "activity": n["activation_count"],
+        "soft_energy": 1, "scale": 1, "activity": n["activation_count"], "active": n["activation_count"],
+        "before": n["activation_count"], "pull": n["activation_count"],
+        "feature": 3 * n["feature_columns"] * n["feature_count"], "transform": 12 * a, "push": 12 * a,
         "features": 9 * n["feature_columns"] * n["used_count"], "response": n["response_size"],
         "mode_rows": n["mode_rows"], "mode_tree": n["mode_tree"],
         "mode_force": 9 * c if n["block_count"] else 0,

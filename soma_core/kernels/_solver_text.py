@@ -28,7 +28,8 @@ def prelude(
     lines.append("const C* second = K; const C* offsets = K + 16 * pair_count;")
     lines.append("const C* lefts = offsets + 3 * all_count; const C* rights = lefts + 9 * channel_count;")
     lines.append("const C* axes = rights + 9 * channel_count;")
-    lines.append("const C* sizes = axes + 3 * channel_count; const C* shares = sizes + weighted_count;")
+    lines.append("const C* binds = axes + 3 * channel_count; const C* sizes = binds + 12 * all_count;")
+    lines.append("const C* shares = sizes + weighted_count;")
     lines.append("const V zero = V{}; const V one = zero + R(1);")
     return "\n".join(lines) + "\n"
 

@@ -137,7 +137,8 @@ class PoseSolver:
             place["accepted"], place["last_change"], place["turns"], 9 * counts["all_count"], place["places"],
             3 * counts["all_count"], place["residual"], place["slope"] + 3 * d, 3 * (c - d) + 3,
             place["damping"],
-            place["activity"], counts["activation_count"], place["scale"],
+            place["activity"], counts["activation_count"], place["scale"], place["transform"],
+            place["active"], place["before"], place["push"], place["pull"], place["gained"],
         )  # fmt: skip
         self.at = torch.tensor(at, dtype=torch.int32, device=device)
         self.memory, self.kept = sum(slots.values()), sum(kept.values())
@@ -188,23 +189,93 @@ class PoseSolver:
 
     def walked(self, constants: tuple[Tensor, bool], relative: Tensor, hips: Tensor) -> tuple[Tensor, Tensor]:
         """World turns (F, J', 3, 3) and places (F, J', 3) of all joints."""
-        count = self.counts["all_count"]
-        turns, places = relative.new_empty(len(hips), count, 3, 3), hips.new_empty(len(hips), count, 3)
-        kernel = tree_kernels(scalar_name(relative.dtype), lane_count(relative), shared=constants[1]).walked
-        frames = relative.contiguous(), hips.contiguous()
-        self._launch(kernel, constants[0], relative, tuple(map(as_warp, (*frames, turns, places))))
-        return turns, places
+        return self._posed(constants, relative, hips, whole=False)[:2]
+
+    def posed(
+        self, constants: tuple[Tensor, bool], relative: Tensor, hips: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
+        """What :meth:`walked` gives, and what poses give the model's residual.
+
+        Returns:
+            Turns and places; ``G B^-1`` (F, J', 3, 4) of all joints; activations (F, C), what goes into them,
+            and their slopes.
+        """
+        return self._posed(constants, relative, hips, whole=True)
+
+    def _posed(self, constants, relative, hips, *, whole: bool):
+        count, frames, few = self.counts["all_count"], len(hips), self.counts["activation_count"]
+        turns, places = relative.new_empty(frames, count, 3, 3), hips.new_empty(frames, count, 3)
+        transforms = relative.new_empty(frames if whole else 0, count, 3, 4)
+        activations = [relative.new_empty(frames if whole else 0, few) for _ in range(3)]
+        kernel = self._tree(relative, constants).posed
+        given = relative.contiguous(), hips.contiguous(), turns, places, transforms, *activations
+        self._launch(kernel, constants[0], relative, tuple(map(as_warp, given)), task={"outcome": int(whole)})
+        return turns, places, transforms, *activations
 
     def slopes(
-        self, constants: tuple[Tensor, bool], relative: Tensor, hips: Tensor, residual: Tensor
-    ) -> Tensor:
-        """``J^T r`` (F, n + 1, 3) by turns of the variables, ascending, and by the translation."""
+        self, constants: tuple[Tensor, bool], relative: Tensor, hips: Tensor, forces: Tensor,
+        pull: Tensor | None, activity: Tensor | None,
+    ) -> tuple[Tensor, Tensor]:  # fmt: skip
+        """Half the slope (F, n + 1, 3) of the error, and the moments ``P`` (F, T, 3, 4) of what is left.
+
+        Args:
+            constants, relative, hips: of :meth:`posed`.
+            forces: half the slope in the transforms, (F, J', 3, 4).
+            pull: half the slope in the activations, (F, C); None without.
+            activity: slopes of the activations, of :meth:`posed`; None without.
+        """
         size = self.columns - self.driven + 1
         slope = hips.new_empty(len(hips), size, 3)
-        kernel = tree_kernels(scalar_name(relative.dtype), lane_count(relative), shared=constants[1]).slopes
-        frames = relative.contiguous(), hips.contiguous(), residual.contiguous()
-        self._launch(kernel, constants[0], relative, tuple(map(as_warp, (*frames, slope))))
-        return _ascending(slope)
+        residual = hips.new_empty(len(hips), self.counts["weighted_count"], 3, 4)
+        none = hips.new_empty(len(hips), 0)
+        frames = [relative, hips, forces, *(none if one is None else one for one in (pull, activity))]
+        given = *(one.contiguous() for one in frames), slope, residual
+        kernel = self._tree(relative, constants).slopes
+        self._launch(kernel, constants[0], relative, tuple(map(as_warp, given)))
+        return _ascending(slope), residual
+
+    def moved(
+        self, constants: tuple[Tensor, bool], relative: Tensor, hips: Tensor, step: Tensor, *, longest: float
+    ) -> tuple[Tensor, Tensor]:
+        """Poses after a step (F, n + 1, 3); hinges are as the step has them."""
+        outputs = torch.empty_like(relative, memory_format=torch.contiguous_format), torch.empty_like(hips)
+        given = relative.contiguous(), hips.contiguous(), _ascending(step).contiguous(), *outputs
+        none = relative.new_zeros(1)
+        softs = torch.zeros(1, dtype=torch.int32, device=relative.device)
+        self._launch(
+            self._tree(relative, constants).moved, constants[0], relative,
+            (as_warp(softs), as_warp(none), longest, *map(as_warp, given)), task={"hinge_end": self.driven},
+        )  # fmt: skip
+        return outputs
+
+    def doubted(
+        self, relative: Tensor, turns: Tensor, columns: Tensor, axes: Tensor, squares: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """Doubt (F,) of joints' twists, and half its derivative (F, n + 1, 3) by the variables.
+
+        Args:
+            relative: (F, J, 3, 3).
+            turns: of all joints in the world, (F, J', 3, 3).
+            columns: (q,) int32 column of each joint.
+            axes: (q, 3) of each twist.
+            squares: (1 or F, q) of the doubt [1/rad^2].
+        """
+        share = relative.new_empty(len(relative))
+        slope = relative.new_empty(len(relative), self.columns - self.driven + 1, 3)
+        lanes = lane_count(relative)
+        given = (
+            columns, axes.contiguous(), to_lanes(squares, lanes).flatten(1), relative.contiguous(),
+            turns.contiguous(), share, slope,
+        )  # fmt: skip
+        self._launch(
+            tree_kernels(scalar_name(relative.dtype), lanes, shared=True).doubted, relative.new_zeros(1, 1),
+            relative, tuple(map(as_warp, given)), task={"soft_count": len(columns)},
+        )  # fmt: skip
+        return share, _ascending(slope)
+
+    @staticmethod
+    def _tree(like: Tensor, constants: tuple[Tensor, bool]):
+        return tree_kernels(scalar_name(like.dtype), lane_count(like), shared=constants[1])
 
     def factorise(
         self, constants: tuple[Tensor, bool], relative: Tensor, hips: Tensor, damping: Tensor, mass: Tensor,

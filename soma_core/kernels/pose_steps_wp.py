@@ -42,41 +42,90 @@ def _enter(scalar: str, lanes: int, *, shared: bool):
 
 @functools.cache
 def tree_kernels(scalar: str, lanes: int, *, shared: bool) -> SimpleNamespace:
-    """The tree of a pose, and what residuals ask of its joints."""
+    """The tree of a pose, what it gives the model's residual, and what that says of its joints."""
     number = getattr(wp, scalar)
     real, rows = wp.array(dtype=number), wp.array2d(dtype=number)
-    forces, width = solver_functions(scalar, lanes, shared=shared).forces, lanes
+    body, width = solver_functions(scalar, lanes, shared=shared), lanes
+    forces, transform, activate, pull, turn = body.forces, body.transform, body.activate, body.pull, body.turn
+    move, keep, doubt = body.move, body.keep, body.doubt
     (load, store), enter = transposing(scalar, lanes), _enter(scalar, lanes, shared=shared)
     module = wp.get_module(f"soma_pose_tree_{scalar}_{lanes}_{'one' if shared else 'each'}")
 
     @wp.kernel(module=module, enable_backward=False)
-    def walked(
+    def posed(
         task: Task, plan: _ids, numbers: real, constants: rows, memory: rows, kept: rows, at: _ids,
-        relative: real, hips: real, turns: real, places: real,
+        relative: real, hips: real, turns: real, places: real, transforms: real, active: real, before: real,
+        slope: real,
     ):  # fmt: skip
-        w = wp.tid()
+        w, size, count = wp.tid(), 4 * at[14], at[20] * task.outcome
         for g in range(task.begin + w, task.end, memory.shape[0]):
             f, last = g * width, task.frames - 1
             s, m, k = memory[w], kept[w], constants[wp.min(g, constants.shape[0] - 1)]
             enter(plan, numbers, k, s, m, at, f, last, relative, hips)
             store(s, at[11], at[12], turns, wp.int64(at[12]), 0, f, last)
             store(s, at[13], at[14], places, wp.int64(at[14]), 0, f, last)
+            if task.outcome > 0:
+                transform(plan, numbers, k, s, m)
+                activate(plan, numbers, k, s, m)
+            store(s, at[22], size * task.outcome, transforms, wp.int64(size), 0, f, last)
+            store(s, at[23], count, active, wp.int64(count), 0, f, last)
+            store(s, at[24], count, before, wp.int64(count), 0, f, last)
+            store(s, at[19], count, slope, wp.int64(count), 0, f, last)
 
     @wp.kernel(module=module, enable_backward=False)
     def slopes(
         task: Task, plan: _ids, numbers: real, constants: rows, memory: rows, kept: rows, at: _ids,
-        relative: real, hips: real, residual: real, slope: real,
+        relative: real, hips: real, push: real, pulls: real, activity: real, slope: real, residual: real,
+    ):  # fmt: skip
+        w, size, count = wp.tid(), 4 * at[14], at[20]
+        for g in range(task.begin + w, task.end, memory.shape[0]):
+            f, last = g * width, task.frames - 1
+            s, m, k = memory[w], kept[w], constants[wp.min(g, constants.shape[0] - 1)]
+            enter(plan, numbers, k, s, m, at, f, last, relative, hips)
+            load(push, wp.int64(size), 0, size, f, last, s, at[25])
+            load(pulls, wp.int64(count), 0, count, f, last, s, at[26])
+            load(activity, wp.int64(count), 0, count, f, last, s, at[19])
+            pull(plan, numbers, k, s, m)
+            store(s, at[15], at[6], residual, wp.int64(at[6]), 0, f, last)
+            forces(plan, numbers, k, s, m)
+            turn(plan, numbers, k, s, m)
+            store(s, at[16], at[17], slope, wp.int64(at[17]), 0, f, last)
+
+    @wp.kernel(module=module, enable_backward=False)
+    def moved(
+        task: Task, plan: _ids, numbers: real, constants: rows, memory: rows, kept: rows, at: _ids,
+        softs: _ids, stiffs: real, longest: number,
+        relative: real, hips: real, step: real, relative_out: real, hips_out: real,
     ):  # fmt: skip
         w = wp.tid()
         for g in range(task.begin + w, task.end, memory.shape[0]):
             f, last = g * width, task.frames - 1
             s, m, k = memory[w], kept[w], constants[wp.min(g, constants.shape[0] - 1)]
             enter(plan, numbers, k, s, m, at, f, last, relative, hips)
-            load(residual, wp.int64(at[6]), 0, at[6], f, last, s, at[15])
-            forces(plan, numbers, k, s, m)
+            load(step, wp.int64(at[17]), 0, at[17], f, last, s, at[16])
+            keep(plan, numbers, k, s, m)
+            move(plan, numbers, k, s, m, stiffs, 0, task.hinge_end, longest)
+            store(s, at[0], at[5], relative_out, wp.int64(at[5]), 0, f, last)
+            store(s, at[1], 3, hips_out, wp.int64(3), 0, f, last)
+
+    @wp.kernel(module=module, enable_backward=False)
+    def doubted(
+        task: Task, plan: _ids, numbers: real, constants: rows, memory: rows, kept: rows, at: _ids,
+        columns: _ids, spins: real, squares: rows,
+        relative: real, turns: real, share: real, slope: real,
+    ):  # fmt: skip
+        w = wp.tid()
+        for g in range(task.begin + w, task.end, memory.shape[0]):
+            f, last = g * width, task.frames - 1
+            s, m, k = memory[w], kept[w], constants[0]
+            load(relative, wp.int64(at[5]), 0, at[5], f, last, s, at[7])
+            load(turns, wp.int64(at[12]), 0, at[5], f, last, s, at[11])
+            own = squares[wp.min(g, squares.shape[0] - 1)]
+            doubt(plan, numbers, k, s, m, columns, spins, own, task.soft_count)
+            store(s, at[27], 1, share, wp.int64(1), 0, f, last)
             store(s, at[16], at[17], slope, wp.int64(at[17]), 0, f, last)
 
-    return SimpleNamespace(walked=walked, slopes=slopes)
+    return SimpleNamespace(posed=posed, slopes=slopes, moved=moved, doubted=doubted)
 
 
 @functools.cache

@@ -17,9 +17,6 @@ __all__ = ["PoseFit"]
 _SKIN_ITERATIONS = 40
 """Largest number of steps before blend shapes come in; they cost next to nothing."""
 
-_BURST = 6
-"""Steps under the whole model after which frames that have converged are left alone."""
-
 
 class PoseFit:
     """Fits poses of one body.
@@ -48,7 +45,8 @@ class PoseFit:
         problem = self.problem(target)
         pose = self._skinned(problem)
         if self.rig.blended and self._iterations:
-            pose = self._descended(problem, replace(pose, accepted=torch.zeros_like(pose.accepted)))
+            pose = replace(pose, accepted=torch.zeros_like(pose.accepted))
+            pose = Refinement(self.rig, problem)(pose, iterations=self._iterations, tolerance=self._tolerance)
         return replace(pose, translation=pose.translation + problem.origin)
 
     def problem(self, target: Tensor) -> Problem:
@@ -68,16 +66,3 @@ class PoseFit:
         shift = best_translation(problem.target, rest, turns[:, joints], places[:, joints])
         pose = replace(pose, translation=shift)
         return rig.solver(problem.target, rest, pose, iterations=_SKIN_ITERATIONS, tolerance=self._tolerance)
-
-    def _descended(self, problem: Problem, pose: Pose) -> Pose:
-        """Descent on the whole model; frames that rest are left alone."""
-        rows = torch.arange(len(pose.accepted), device=pose.accepted.device)
-        for done in range(0, self._iterations, _BURST):
-            if not len(rows):
-                break
-            steps = min(_BURST, self._iterations - done)
-            refinement = Refinement(self.rig, problem.part(rows))
-            found = refinement(pose.part(rows), iterations=steps, tolerance=self._tolerance)
-            pose = pose.put(rows, found)
-            rows = rows[found.last_change > 0]
-        return pose
