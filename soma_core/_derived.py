@@ -76,7 +76,10 @@ class Derived(torch.nn.Module):
     def __reduce__(self):
         kind = {"device": self.device, "dtype": self.dtype}
         given = self._given | {name: value for name, value in kind.items() if name in self._given}
-        return functools.partial(type(self), **given), (), {"training": self.training}
+        # copy.deepcopy copies these, which come first, and shares what the function holds: meshes, registries.
+        modules = {name: value for name, value in given.items() if isinstance(value, torch.nn.Module)}
+        rest = {name: value for name, value in given.items() if name not in modules}
+        return functools.partial(type(self), **rest), tuple(modules.values()), {"training": self.training}
 
 
 def own_precision(method: Callable[Concatenate[Any, _P], _R]) -> Callable[Concatenate[Any, _P], _R]:
