@@ -21,7 +21,8 @@ class Derived(torch.nn.Module):
     """A module that is what it was made from: its constants are derived in float64, and never cast.
 
     Moved or converted, by itself or inside a network, it derives them again. A network that is cast to half
-    precision leaves it as it is. Copies and pickles hold what it was made from, and derive it anew.
+    precision, or taken to the meta device, leaves it as it is. Copies and pickles hold what it was made from,
+    and derive it anew.
 
     Args:
         given: arguments of the constructor; others that are in it, such as `self`, do not matter.
@@ -49,7 +50,7 @@ class Derived(torch.nn.Module):
         here = torch.empty(0, dtype=self.dtype, device=self.device)
         there = fn(here)
         dtype = there.dtype if there.dtype in _DTYPES else self.dtype
-        if (there.device, dtype) != (here.device, here.dtype):
+        if not there.is_meta and (there.device, dtype) != (here.device, here.dtype):
             self._build(there.device, dtype)
         return self
 
@@ -76,7 +77,7 @@ class Derived(torch.nn.Module):
     def __reduce__(self):
         kind = {"device": self.device, "dtype": self.dtype}
         given = self._given | {name: value for name, value in kind.items() if name in self._given}
-        # copy.deepcopy copies these, which come first, and shares what the function holds: meshes, registries.
+        # copy.deepcopy copies these, which come first, and shares what the function holds, such as meshes.
         modules = {name: value for name, value in given.items() if isinstance(value, torch.nn.Module)}
         rest = {name: value for name, value in given.items() if name not in modules}
         return functools.partial(type(self), **rest), tuple(modules.values()), {"training": self.training}
