@@ -36,12 +36,13 @@ def check_choice(argument: str, value: object, choices: tuple[object, ...]) -> N
 
 
 def widened(value: Tensor, dtype: torch.dtype) -> Tensor:
-    """A tensor of half precision, which a network around may compute in, as `dtype`; others as they are."""
-    return value.to(dtype) if value.dtype in (torch.float16, torch.bfloat16) else value
+    """A tensor of half precision, which a network around may compute in, as `dtype`; the rest as it is."""
+    half = isinstance(value, Tensor) and value.dtype in (torch.float16, torch.bfloat16)
+    return value.to(dtype) if half else value
 
 
-def check_kind(name: str, value: object, dtype: torch.dtype, device: torch.device) -> Tensor:
-    """The tensor, :func:`widened`; refuse what is none, or one of another dtype or device."""
+def check_kind(name: str, value: object, dtype: torch.dtype, device: torch.device) -> None:
+    """Refuse what is no tensor, or a tensor of another dtype or device."""
     if not isinstance(value, Tensor):
         raise InputError(
             name,
@@ -49,7 +50,6 @@ def check_kind(name: str, value: object, dtype: torch.dtype, device: torch.devic
             expected="a torch.Tensor",
             fix=f"Wrap it: torch.as_tensor({name}).",
         )
-    value = widened(value, dtype)
     if value.dtype != dtype:
         raise InputError(
             name,
@@ -59,7 +59,6 @@ def check_kind(name: str, value: object, dtype: torch.dtype, device: torch.devic
         )
     if value.device.type != device.type or (device.index is not None and value.device != device):
         raise InputError(name, got=value.device, expected=device, fix=f"Call {name}.to({str(device)!r}).")
-    return value
 
 
 def may_look(value: Tensor) -> bool:
@@ -86,7 +85,8 @@ def check_rotations(
     rotations: Tensor, joint_count: int, dtype: torch.dtype, device: torch.device, *, validate: bool
 ) -> Tensor:
     """Matrices (batch, joints, 3, 3) from axis-angle or matrices, or a clear refusal."""
-    rotations = check_kind("rotations", rotations, dtype, device)
+    rotations = widened(rotations, dtype)
+    check_kind("rotations", rotations, dtype, device)
     shape = tuple(rotations.shape)
     axis_angle = rotations.ndim == 3 and shape[1:] == (joint_count, 3)
     if not axis_angle and not (rotations.ndim == 4 and shape[1:] == (joint_count, 3, 3)):
@@ -133,7 +133,8 @@ def check_translation(
     """Hips positions (batch, 3) [m]; zeros when None."""
     if translation is None:
         return torch.zeros(batch, 3, dtype=dtype, device=device)
-    translation = check_kind("translation", translation, dtype, device)
+    translation = widened(translation, dtype)
+    check_kind("translation", translation, dtype, device)
     if tuple(translation.shape) not in ((3,), (1, 3), (batch, 3)):
         raise InputError(
             "translation",
@@ -151,7 +152,8 @@ def check_bone_scale(
     """Factors (1 or batch, joints) of the bone vectors, positive; None where none are given."""
     if bone_scale is None:
         return None
-    bone_scale = check_kind("bone_scale", bone_scale, dtype, device)
+    bone_scale = widened(bone_scale, dtype)
+    check_kind("bone_scale", bone_scale, dtype, device)
     if tuple(bone_scale.shape) not in ((1, joint_count), (batch, joint_count)):
         raise InputError(
             "bone_scale",
@@ -173,7 +175,8 @@ def check_bone_scale(
 
 def check_rest(rest: Tensor, vertex_count: int, dtype: torch.dtype, device: torch.device) -> Tensor:
     """Vertices (batch, v, 3) of the canonical mesh, or a clear refusal."""
-    rest = check_kind("rest", rest, dtype, device)
+    rest = widened(rest, dtype)
+    check_kind("rest", rest, dtype, device)
     if rest.ndim != 3 or tuple(rest.shape[1:]) != (vertex_count, 3):
         raise InputError(
             "rest",

@@ -198,6 +198,16 @@ def test_autocast_changes_nothing(bodies, single):
     assert_same((*results, *torch.autograd.grad(loss, tracked)), single)
 
 
+@pytest.mark.filterwarnings("ignore::DeprecationWarning:torch")
+def test_compiles_in_one_graph_under_autocast(bodies):
+    torch._dynamo.reset()
+    compiled = torch.compile(bodies, fullgraph=True, backend="aot_eager")
+    seed = randn(FRAMES, 2, seed=7, dtype=torch.float32)
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        torch.testing.assert_close(compiled(seed).vertices, bodies(seed).vertices, atol=1e-5, rtol=0)
+    torch._dynamo.reset()
+
+
 # --- torch.func -----------------------------------------------------------------------------------------
 
 
