@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable, Mapping
-from typing import Any, Concatenate, ParamSpec, TypeVar
+from typing import Any, Self, TypeVar, cast
 
 import torch
 from torch import Tensor
@@ -14,7 +14,7 @@ from soma_core._inputs import check_choice
 __all__ = ["Derived", "own_precision"]
 
 _DTYPES = (torch.float32, torch.float64)
-_P, _R = ParamSpec("_P"), TypeVar("_R")
+_Method = TypeVar("_Method", bound=Callable[..., Any])
 
 
 class Derived(torch.nn.Module):
@@ -54,7 +54,7 @@ class Derived(torch.nn.Module):
             self._build(there.device, dtype)
         return self
 
-    def to(self, *args, **kwargs):
+    def to(self, *args: Any, **kwargs: Any) -> Self:
         """Move or convert in place; takes what ``torch.nn.Module.to`` does.
 
         Raises:
@@ -66,11 +66,11 @@ class Derived(torch.nn.Module):
                 check_choice("dtype", kind, _DTYPES)
         return super().to(*args, **kwargs)
 
-    def half(self):
+    def half(self) -> Self:
         """Refused, as in :meth:`to`."""
         return self.to(torch.float16)
 
-    def bfloat16(self):
+    def bfloat16(self) -> Self:
         """Refused, as in :meth:`to`."""
         return self.to(torch.bfloat16)
 
@@ -83,14 +83,14 @@ class Derived(torch.nn.Module):
         return functools.partial(type(self), **rest), tuple(modules.values()), {"training": self.training}
 
 
-def own_precision(method: Callable[Concatenate[Any, _P], _R]) -> Callable[Concatenate[Any, _P], _R]:
+def own_precision(method: _Method) -> _Method:
     """Compute a method in its module's own precision, whatever ``torch.autocast`` says around it."""
 
     @functools.wraps(method)
-    def exact(self: Any, *args: _P.args, **kwargs: _P.kwargs) -> _R:
+    def exact(self, *args, **kwargs):
         if not torch.is_autocast_enabled(self.device.type):
             return method(self, *args, **kwargs)
         with torch.autocast(self.device.type, enabled=False):
             return method(self, *args, **kwargs)
 
-    return exact
+    return cast(_Method, exact)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import TYPE_CHECKING, Any, Literal, get_args
 
 import torch
 from torch import Tensor
@@ -329,6 +329,9 @@ class SomaLayer(Derived):
 
         bodies = (body(slice(start, start + _CHUNK)) for start in range(0, size, _CHUNK))
         return self.posing.pose_all(bodies, size, absolute=absolute)
+
+    if TYPE_CHECKING:  # torch says that a module returns anything
+        __call__ = forward
 
 
 def _common_batch(identities: int, poses: int) -> int:

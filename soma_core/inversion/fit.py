@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Literal, get_args
+from typing import TYPE_CHECKING, Literal, get_args
 
 import torch
 from torch import Tensor
@@ -199,6 +199,9 @@ class PoseInversion(Derived):
         if not (torch.is_grad_enabled() and canonical.requires_grad):
             return result
         return self._with_gradient(canonical, frames, result)
+
+    if TYPE_CHECKING:  # torch says that a module returns anything
+        __call__ = forward
 
     def _with_gradient(self, vertices: Tensor, frames: _Frames, result: InversionResult) -> InversionResult:
         if self.ladder.options.robust is not None or self.priors.temporal_strength:

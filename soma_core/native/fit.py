@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import Any, get_args
+from typing import TYPE_CHECKING, Any, get_args
 
 import torch
 from torch import Tensor
@@ -140,6 +140,9 @@ class NativeFit(Derived):
         with torch.no_grad():
             fit = self._prepared(self._one_body(params), self._weights(weights))
         return _joined([self._fit(fit, part) for part in target.split(_CHUNK)])
+
+    if TYPE_CHECKING:  # torch says that a module returns anything
+        __call__ = forward
 
     @own_precision
     @torch.no_grad()
