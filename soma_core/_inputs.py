@@ -7,11 +7,38 @@ from torch import Tensor
 
 from soma_core.errors import InputError
 from soma_core.geometry.rotations import axis_angle_to_matrix, orthonormality_error
+from soma_core.geometry.torch_func import transformed
 
-__all__ = ["check_bone_scale", "check_kind", "check_rest", "check_rotations", "check_translation"]
+__all__ = [
+    "check_bone_scale",
+    "check_choice",
+    "check_kind",
+    "check_rest",
+    "check_rotations",
+    "check_translation",
+    "may_look",
+    "widened",
+]
 
 _ROTATION_TOLERANCE = 1e-2
 """Largest accepted entry of |R^T R - I|: above it a matrix is a mistake, not rounding."""
+
+
+def check_choice(argument: str, value: object, choices: tuple[object, ...]) -> None:
+    """Refuse what is none of `choices`."""
+    if value not in choices:
+        raise InputError(
+            argument,
+            got=repr(value),
+            expected="one of " + ", ".join(map(repr, choices)),
+            fix=f"Pass {argument}={choices[0]!r}.",
+        )
+
+
+def widened(value: Tensor, dtype: torch.dtype) -> Tensor:
+    """A tensor of half precision, which a network around may compute in, as `dtype`; the rest as it is."""
+    half = isinstance(value, Tensor) and value.dtype in (torch.float16, torch.bfloat16)
+    return value.to(dtype) if half else value
 
 
 def check_kind(name: str, value: object, dtype: torch.dtype, device: torch.device) -> None:
@@ -34,13 +61,13 @@ def check_kind(name: str, value: object, dtype: torch.dtype, device: torch.devic
         raise InputError(name, got=value.device, expected=device, fix=f"Call {name}.to({str(device)!r}).")
 
 
-def _may_look(value: Tensor) -> bool:
-    """Whether values can be read without waiting for a device or breaking a graph."""
-    return not torch.compiler.is_compiling() and value.device.type == "cpu"
+def may_look(value: Tensor) -> bool:
+    """Whether values can be read without waiting for a device or breaking a graph or a transform."""
+    return not torch.compiler.is_compiling() and value.device.type == "cpu" and not transformed()
 
 
 def _check_finite(name: str, value: Tensor) -> None:
-    if not _may_look(value) or torch.isfinite(value.detach().sum()):
+    if not may_look(value) or torch.isfinite(value.detach().sum()):
         return
     finite = torch.isfinite(value.detach())
     if finite.all():  # the sum overflowed, the entries are fine
@@ -58,6 +85,7 @@ def check_rotations(
     rotations: Tensor, joint_count: int, dtype: torch.dtype, device: torch.device, *, validate: bool
 ) -> Tensor:
     """Matrices (batch, joints, 3, 3) from axis-angle or matrices, or a clear refusal."""
+    rotations = widened(rotations, dtype)
     check_kind("rotations", rotations, dtype, device)
     shape = tuple(rotations.shape)
     axis_angle = rotations.ndim == 3 and shape[1:] == (joint_count, 3)
@@ -71,7 +99,7 @@ def check_rotations(
     _check_finite("rotations", rotations)
     if axis_angle:
         return axis_angle_to_matrix(rotations)
-    if validate and _may_look(rotations):
+    if validate and may_look(rotations):
         _check_orthonormal(rotations.detach())
     return rotations
 
@@ -105,6 +133,7 @@ def check_translation(
     """Hips positions (batch, 3) [m]; zeros when None."""
     if translation is None:
         return torch.zeros(batch, 3, dtype=dtype, device=device)
+    translation = widened(translation, dtype)
     check_kind("translation", translation, dtype, device)
     if tuple(translation.shape) not in ((3,), (1, 3), (batch, 3)):
         raise InputError(
@@ -123,6 +152,7 @@ def check_bone_scale(
     """Factors (1 or batch, joints) of the bone vectors, positive; None where none are given."""
     if bone_scale is None:
         return None
+    bone_scale = widened(bone_scale, dtype)
     check_kind("bone_scale", bone_scale, dtype, device)
     if tuple(bone_scale.shape) not in ((1, joint_count), (batch, joint_count)):
         raise InputError(
@@ -132,7 +162,7 @@ def check_bone_scale(
             fix="Give one factor a user joint, for all poses or for each; 1 leaves a bone as it is.",
         )
     _check_finite("bone_scale", bone_scale)
-    if _may_look(bone_scale) and not bool((bone_scale.detach() > 0).all()):
+    if may_look(bone_scale) and not bool((bone_scale.detach() > 0).all()):
         where = tuple(int(i) for i in torch.nonzero(bone_scale.detach() <= 0)[0])
         raise InputError(
             f"bone_scale[{where[0]}, {where[1]}]",
@@ -143,8 +173,9 @@ def check_bone_scale(
     return bone_scale
 
 
-def check_rest(rest: Tensor, vertex_count: int, dtype: torch.dtype, device: torch.device) -> None:
-    """Refuse what are no vertices (batch, v, 3) of the canonical mesh."""
+def check_rest(rest: Tensor, vertex_count: int, dtype: torch.dtype, device: torch.device) -> Tensor:
+    """Vertices (batch, v, 3) of the canonical mesh, or a clear refusal."""
+    rest = widened(rest, dtype)
     check_kind("rest", rest, dtype, device)
     if rest.ndim != 3 or tuple(rest.shape[1:]) != (vertex_count, 3):
         raise InputError(
@@ -154,3 +185,4 @@ def check_rest(rest: Tensor, vertex_count: int, dtype: torch.dtype, device: torc
             fix="Bring other topologies to it first: transfer or register them.",
         )
     _check_finite("rest", rest)
+    return rest

@@ -5,12 +5,20 @@ from __future__ import annotations
 import functools
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import TYPE_CHECKING, Any, Literal, get_args
 
 import torch
 from torch import Tensor
 
-from soma_core._inputs import check_bone_scale, check_kind, check_rest, check_rotations, check_translation
+from soma_core._derived import Derived, own_precision
+from soma_core._inputs import (
+    check_bone_scale,
+    check_choice,
+    check_kind,
+    check_rest,
+    check_rotations,
+    check_translation,
+)
 from soma_core.animation.engine import Animation, Body, ProceduralAnimation
 from soma_core.animation.kinematics import relative_from_absolute
 from soma_core.animation.posed import Posed
@@ -18,6 +26,7 @@ from soma_core.backends.parameters import batch_parameters
 from soma_core.backends.rest_shape import make_rest_shape
 from soma_core.correctives.model import find_correctives, load_correctives
 from soma_core.errors import InputError
+from soma_core.geometry.torch_func import transformed
 from soma_core.plugin.registry import Registry, default_registry
 from soma_core.rig import load_canonical
 from soma_core.rig.mesh import CanonicalMesh, Lod
@@ -33,7 +42,7 @@ _CHUNK = 32
 """Bodies evaluated at a time where nothing is kept for a gradient."""
 
 
-class SomaLayer(torch.nn.Module):
+class SomaLayer(Derived):
     """Any identity backend, animated on the canonical rig.
 
     ``identity`` and ``pose`` are functions of their arguments: the layer keeps no identity and no cache,
@@ -79,15 +88,9 @@ class SomaLayer(torch.nn.Module):
         canonical: tuple[CanonicalMesh, Rig] | None = None,
         registry: Registry | None = None,
     ) -> None:
-        super().__init__()
-        self._given = {
-            "backend": backend, "options": dict(options or {}), "lod": lod, "kernels": kernels,
-            "exact": exact, "repose": repose, "procedural": procedural, "correctives": correctives,
-            "validate": validate, "canonical": canonical, "registry": registry,
-        }  # fmt: skip
-        _check_choice("lod", lod, get_args(Lod))
-        _check_choice("kernels", kernels, ("auto", "torch", "warp"))
-        _check_choice("dtype", dtype, (torch.float32, torch.float64))
+        super().__init__(locals(), device, dtype)
+        check_choice("lod", lod, get_args(Lod))
+        check_choice("kernels", kernels, get_args(Kernels))
         self.backend = backend
         self.options = dict(options or {})
         self.kernels = kernels
@@ -98,7 +101,7 @@ class SomaLayer(torch.nn.Module):
         self.correctives_file = find_correctives(correctives, shipped=shipped)
         self._registry = registry or default_registry()
         self.spec = self._registry.spec(backend)
-        self._build(torch.device(device), dtype)
+        self._build(self.device, dtype)
 
     def _build(self, device: torch.device, dtype: torch.dtype) -> None:
         self.device, self.dtype = device, dtype
@@ -128,18 +131,6 @@ class SomaLayer(torch.nn.Module):
             f"correctives={str(self.correctives_file) if self.correctives_file else None!r}"
         )
 
-    def _apply(self, fn, recurse=True):  # noqa: ARG002 - PyTorch's signature
-        """Rebuild for the new device or dtype: constants are derived in float64, never cast twice."""
-        probe = fn(torch.empty(0, dtype=self.dtype, device=self.device))
-        if (probe.device, probe.dtype) != (self.device, self.dtype):
-            _check_choice("dtype", probe.dtype, (torch.float32, torch.float64))
-            self._build(probe.device, probe.dtype)
-        return self
-
-    def __reduce__(self):
-        """Copy and pickle by building again: a layer is what it was built from."""
-        return functools.partial(SomaLayer, **self._given, device=self.device, dtype=self.dtype), ()
-
     @property
     def plain(self) -> bool:
         """Whether :meth:`pose` is linear blend skinning alone, without twist joints and correctives."""
@@ -150,6 +141,7 @@ class SomaLayer(torch.nn.Module):
         """Names of the user joints, in the order of `rotations`."""
         return self.rig.user_joint_names
 
+    @own_precision
     def identity(self, params: Mapping[str, Any] | None = None) -> Identity:
         """Prepare identities: rest shape on the canonical mesh and the skeleton fitted to it.
 
@@ -163,6 +155,7 @@ class SomaLayer(torch.nn.Module):
         batch = batch_parameters(self.spec, params, device=self.device, dtype=self.dtype)
         return self._identity(batch, *self.rest_shape(batch))
 
+    @own_precision
     def identity_from_rest(self, rest: Tensor) -> Identity:
         """Prepare identities of bodies that no parameters describe, such as scans on the canonical mesh.
 
@@ -175,7 +168,7 @@ class SomaLayer(torch.nn.Module):
         """
         reduction = self.rest_shape.reduction
         count = self.mesh.vertex_count if reduction is None else reduction.source_count
-        check_rest(rest, count, self.dtype, self.device)
+        rest = check_rest(rest, count, self.dtype, self.device)
         points = rest if reduction is None else reduction(rest)
         return self._identity({}, points.permute(2, 1, 0).contiguous(), self.rest_shape.fit(rest))
 
@@ -191,6 +184,7 @@ class SomaLayer(torch.nn.Module):
             params=params,
         )
 
+    @own_precision
     def pose(
         self,
         identity: Identity,
@@ -218,11 +212,13 @@ class SomaLayer(torch.nn.Module):
         """
         return self.pose_checked(self._body(identity, rotations, translation, bone_scale), absolute=absolute)
 
+    @own_precision
     def pose_checked(self, body: Body, *, absolute: bool = False) -> Posed:
         """:meth:`pose` without its checks, of rotation matrices: for loops that check once."""
         moves = self._offsets(body.identity, body.relative, absolute=absolute)
         return self.posing.pose(*body[:3], absolute=absolute, bone_scale=body.bone_scale, offsets=moves)
 
+    @own_precision
     def pose_plain(
         self,
         identity: Identity,
@@ -240,6 +236,7 @@ class SomaLayer(torch.nn.Module):
         _, relative, shift, scale, _ = self._body(identity, rotations, translation, bone_scale)
         return self.animation.pose(identity, relative, shift, absolute=absolute, bone_scale=scale)
 
+    @own_precision
     def helper_transforms(
         self, identity: Identity, transforms: Tensor, bone_scale: Tensor | None = None
     ) -> Tensor:
@@ -292,6 +289,7 @@ class SomaLayer(torch.nn.Module):
             )
         check_kind("identity", identity.rest, self.dtype, self.device)
 
+    @own_precision
     def forward(
         self,
         params: Mapping[str, Any] | None,
@@ -316,7 +314,7 @@ class SomaLayer(torch.nn.Module):
         relative = relative.expand(size, *relative.shape[1:])
         given = (*batch.values(), relative, shift, *([] if bone_scale is None else [bone_scale]))
         tracked = torch.is_grad_enabled() and any(tensor.requires_grad for tensor in given)
-        tracked = tracked or torch.compiler.is_compiling()  # a compiler plans its own memory
+        tracked = tracked or torch.compiler.is_compiling() or transformed()  # a compiler plans its own memory
         whole = tracked or identities < size or size <= _CHUNK or self.animation.warp_skinning
         if whole:
             identity = self._identity(batch, *self.rest_shape(batch))
@@ -332,6 +330,9 @@ class SomaLayer(torch.nn.Module):
         bodies = (body(slice(start, start + _CHUNK)) for start in range(0, size, _CHUNK))
         return self.posing.pose_all(bodies, size, absolute=absolute)
 
+    if TYPE_CHECKING:  # torch says that a module returns anything
+        __call__ = forward
+
 
 def _common_batch(identities: int, poses: int) -> int:
     if identities == poses or poses == 1:
@@ -344,13 +345,3 @@ def _common_batch(identities: int, poses: int) -> int:
         expected=f"a batch of {identities} or 1",
         fix="Give one pose an identity, one pose for all, or one identity for all poses.",
     )
-
-
-def _check_choice(argument: str, value: object, choices: tuple[object, ...]) -> None:
-    if value not in choices:
-        raise InputError(
-            argument,
-            got=repr(value),
-            expected="one of " + ", ".join(map(repr, choices)),
-            fix=f"Pass {argument}={choices[0]!r}.",
-        )

@@ -26,7 +26,7 @@ TREE_MIB = 24
 RANKS = [
     {"errors", "paths", "cache", "files", "npz", "progress"},
     {"geometry", "plugin"},
-    {"kernels", "_inputs"},
+    {"kernels", "_inputs", "_derived"},
     {"rig", "topology", "skeleton", "animation", "correctives"},
     {"backends", "io"},
     {"layer"},

@@ -745,7 +745,7 @@ def test_wrong_type_of_rotations(tiny):
         tiny()({}, [[0.0] * 3] * JOINTS)
 
 
-@pytest.mark.parametrize("dtype", [torch.float32, torch.int64, torch.float16])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.int64, torch.complex128])
 def test_wrong_dtype_of_rotations(tiny, dtype):
     text = rf"rotations: got {dtype}, expected torch.float64. Call rotations.to\(torch.float64\)"
     with pytest.raises(InputError, match=text):

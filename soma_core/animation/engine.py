@@ -12,6 +12,7 @@ from soma_core.animation.kinematics import Kinematics, relative_from_absolute, t
 from soma_core.animation.posed import Posed
 from soma_core.animation.skinning import Skinning, skinning_transforms
 from soma_core.animation.twist import Twist
+from soma_core.geometry.torch_func import transformed
 from soma_core.rig.skeleton import Rig
 from soma_core.skeleton.identity import Identity
 
@@ -60,7 +61,7 @@ class Animation(torch.nn.Module):
         positions = kinematics.bind_positions(kinematics.local_offsets(fitted), fitted[:, 1, :3, 3])
         rotations = kinematics.bind_rotation.expand(len(fitted), -1, 3, 3)
         transforms = skinning_transforms(rotations, positions, fitted)
-        if self.warp_skinning:
+        if self.warp_skinning and not transformed():
             skinned = _skin_warp(self.skinning, points.permute(2, 1, 0), transforms).permute(2, 1, 0)
         else:
             skinned = self.skinning(points, transforms, rows=False)
@@ -152,9 +153,10 @@ class Animation(torch.nn.Module):
 
     def _skin(self, rest: Tensor, transforms: Tensor) -> Tensor:
         """Posed vertices (B, v, 3), contiguous, from rest vertices (B or 1, v, 3)."""
-        if self.warp_skinning:
+        reference = transformed()
+        if self.warp_skinning and not reference:
             return _skin_warp(self.posed_skinning, rest, transforms)
-        if len(rest) == 1 and not rest.requires_grad:
+        if len(rest) == 1 and not rest.requires_grad and not reference:
             return self.posed_skinning.shared(rest[0], transforms)
         return self.posed_skinning(rest.permute(2, 1, 0), transforms, rows=True)
 

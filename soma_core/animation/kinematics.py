@@ -6,6 +6,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from soma_core.geometry.torch_func import transformed
 from soma_core.rig.skeleton import Rig
 
 __all__ = ["Kinematics", "absolute_from_relative", "joint_levels", "relative_from_absolute", "to_homogeneous"]
@@ -120,7 +121,7 @@ class Kinematics(torch.nn.Module):
         root, limbs = torch.zeros_like(translation)[:, None], offsets[:, 2:].expand(batch, -1, 3)
         turns = torch.cat((eye, relative), 1)
         offsets = torch.cat((root, translation[:, None], limbs), 1)
-        if self.warp:
+        if self.warp and not transformed():
             from soma_core.kernels.kinematics_wp import forward_kinematics
 
             turns, positions = forward_kinematics(turns, offsets, self.order, self.tree)

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from soma_core.geometry.sparse import Csr, SparseRows, gather_rows, sparse_product
+from soma_core.geometry.torch_func import transformed
 
 __all__ = ["Skinning", "skinning_transforms"]
 
@@ -155,6 +156,10 @@ class Skinning(torch.nn.Module):
             transforms: (B, J, 3, 4) from :func:`skinning_transforms`.
         """
         planes = transforms.permute(2, 3, 1, 0)
+        if transformed():
+            blended = self.weights(planes.permute(2, 0, 1, 3).flatten(1)).unflatten(1, planes[:, :, 0].shape)
+            skinned = (blended[:, :, :3] * points.transpose(0, 1)[:, None]).sum(2) + blended[:, :, 3]
+            return skinned.permute(2, 0, 1).contiguous() if rows else skinned.transpose(0, 1)
         return _blend(points, planes, rows, [*self.weights.csr, *self.weights.transpose])
 
     def into(self, out: Tensor, points: Tensor, transforms: Tensor) -> None:

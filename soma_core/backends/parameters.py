@@ -11,6 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from soma_core._inputs import may_look, widened
 from soma_core.errors import InputError
 from soma_core.plugin.spec import BackendSpec, Parameter
 
@@ -28,9 +29,9 @@ def batch_parameters(
     appear in the result whether given or not; grouped ones (there may be hundreds) only when given,
     and a generator takes a missing one as its default.
 
-    Tensors keep their autograd history and must already have `device` and `dtype`. Values are
-    checked to be finite on the CPU, outside ``torch.compile``: elsewhere the check would make the
-    host wait for the device.
+    Tensors keep their autograd history and must already have `device` and `dtype`; half precision is
+    widened. Values are checked to be finite on the CPU, outside ``torch.compile`` and ``torch.func``:
+    elsewhere the check would make the host wait for the device.
 
     Raises:
         InputError: unknown name, wrong shape, batch sizes that disagree, NaN or infinity, an
@@ -96,6 +97,7 @@ def _as_sample_batch(parameter: Parameter, value: Any, *, device: torch.device, 
 
 def _as_tensor(parameter: Parameter, value: Any, *, device: torch.device, dtype: torch.dtype) -> Tensor:
     if isinstance(value, Tensor):
+        value = widened(value, dtype)
         _check_tensor(parameter, value, device=device, dtype=dtype)
         return value
     if isinstance(value, Real) and not isinstance(value, bool):
@@ -172,8 +174,7 @@ def _batch_size(tensors: Mapping[str, Tensor]) -> int:
 
 def _check_finite(tensors: Mapping[str, Tensor]) -> None:
     """Refuse NaN and infinity where looking at values costs no synchronisation."""
-    on_host = all(tensor.device.type == "cpu" for tensor in tensors.values())
-    if not tensors or not on_host or torch.compiler.is_compiling():
+    if not tensors or not all(map(may_look, tensors.values())):
         return
     # x * 0 is 0 for finite x and NaN otherwise; unlike a plain sum it cannot overflow.
     probe = sum((tensor.detach() * 0).sum() for tensor in tensors.values())

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -59,12 +60,12 @@ class Correctives(torch.nn.Module):
         self.first = SparseRows(weights.first.T.tocsr()[used], dtype=dtype, device=device)
         self.second = SparseRows(second[:, used].tocsr(), dtype=dtype, device=device)
         self.owner = used // weights.channels
-        self._rig = rig
+        self._above = rig.parents[2:].tolist()  # a list: torch.compile takes NumPy for values it cannot know
         self.length = float(skeleton_length(torch.as_tensor(rig.bind_world.copy())[None], rig))
 
     def scale(self, bind_world: Tensor) -> Tensor:
         """How large bodies are beside the canonical one, (B,), by the length of their bones."""
-        return skeleton_length(bind_world, self._rig) / self.length
+        return _bone_sum(bind_world, self._above) / self.length
 
     def forward(self, relative: Tensor, bind_world: Tensor) -> Tensor:
         """Offsets (B, v, 3) [m] of rest shapes in the bind pose. Differentiable.
@@ -84,8 +85,12 @@ class Correctives(torch.nn.Module):
 
 def skeleton_length(bind_world: Tensor, rig: Rig) -> Tensor:
     """Sum of all bones below the Hips [m], (B,), of bind transforms (B, J, 4, 4)."""
+    return _bone_sum(bind_world, rig.parents[2:].tolist())
+
+
+def _bone_sum(bind_world: Tensor, above: Sequence[int]) -> Tensor:
     places = bind_world[..., :3, 3]
-    return (places[:, 2:] - places[:, rig.parents[2:].tolist()]).norm(dim=-1).sum(1)
+    return (places[:, 2:] - places[:, above]).norm(dim=-1).sum(1)
 
 
 def find_correctives(given: Path | str | None, *, shipped: bool) -> Path | None:

@@ -7,6 +7,8 @@ import math
 import torch
 from torch import Tensor
 
+from soma_core.geometry.torch_func import transformed
+
 __all__ = ["PRIOR_STRENGTH", "cofactor", "rotation_from_covariance"]
 
 PRIOR_STRENGTH = 1e-5
@@ -71,8 +73,28 @@ def _is_rotation(x: Tensor) -> Tensor:
     return (((x - adjugate).abs().amax((-1, -2)) < 1e-3) & (det > 0))[..., None, None]
 
 
+def _change(covariance: Tensor, rotation: Tensor, moved: Tensor) -> Tensor:
+    """Derivative ``dR = R [xi]x`` with ``(tr(P) I - P) xi = eta``, ``P = R^T H``; its own transpose."""
+    stretch = rotation.transpose(-1, -2) @ covariance
+    stretch = 0.5 * (stretch + stretch.transpose(-1, -2))
+    trace = torch.diagonal(stretch, dim1=-2, dim2=-1).sum(-1)
+    eye = torch.eye(3, dtype=moved.dtype, device=moved.device)
+    system = trace[..., None, None] * eye - stretch
+    local = rotation.transpose(-1, -2) @ moved
+    local = local - local.transpose(-1, -2)
+    torque = torch.stack((local[..., 2, 1], local[..., 0, 2], local[..., 1, 0]), -1)
+    adjugate = cofactor(system)  # symmetric, so the cofactor is the adjugate
+    det = (system[..., 0, :] * adjugate[..., 0, :]).sum(-1)
+    floor = torch.finfo(moved.dtype).tiny + torch.finfo(moved.dtype).eps * trace.abs() ** 3 * 1e-6
+    u = (adjugate @ torque[..., None]).squeeze(-1) / torch.where(det.abs() < floor, floor, det)[..., None]
+    x, y, z = u.unbind(-1)
+    zero = torch.zeros_like(x)
+    generator = torch.stack((zero, -z, y, z, zero, -x, -y, x, zero), -1).unflatten(-1, (3, 3))
+    return rotation @ generator
+
+
 class _NearestRotation(torch.autograd.Function):
-    """Derivative in closed form: ``(tr(P) I - P) xi = eta`` with ``P = R^T H``, ``dR = R [xi]x``."""
+    """The derivative of :func:`_nearest_rotation` in closed form."""
 
     @staticmethod
     def forward(covariance: Tensor) -> Tensor:
@@ -84,23 +106,22 @@ class _NearestRotation(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx, grad: Tensor) -> Tensor:
-        covariance, rotation = ctx.saved_tensors
-        stretch = rotation.transpose(-1, -2) @ covariance
-        stretch = 0.5 * (stretch + stretch.transpose(-1, -2))
-        trace = torch.diagonal(stretch, dim1=-2, dim2=-1).sum(-1)
-        eye = torch.eye(3, dtype=grad.dtype, device=grad.device)
-        system = trace[..., None, None] * eye - stretch
-        local = rotation.transpose(-1, -2) @ grad
-        local = local - local.transpose(-1, -2)
-        torque = torch.stack((local[..., 2, 1], local[..., 0, 2], local[..., 1, 0]), -1)
-        adjugate = cofactor(system)  # symmetric, so the cofactor is the adjugate
-        det = (system[..., 0, :] * adjugate[..., 0, :]).sum(-1)
-        floor = torch.finfo(grad.dtype).tiny + torch.finfo(grad.dtype).eps * trace.abs() ** 3 * 1e-6
-        u = (adjugate @ torque[..., None]).squeeze(-1) / torch.where(det.abs() < floor, floor, det)[..., None]
-        x, y, z = u.unbind(-1)
-        zero = torch.zeros_like(x)
-        generator = torch.stack((zero, -z, y, z, zero, -x, -y, x, zero), -1).unflatten(-1, (3, 3))
-        return rotation @ generator
+        return _change(*ctx.saved_tensors, grad)
+
+
+class _NearestRotationAnyWay(_NearestRotation):
+    """The same for every transform of ``torch.func``."""
+
+    generate_vmap_rule = True
+
+    @staticmethod
+    def setup_context(ctx, inputs, output) -> None:
+        ctx.save_for_backward(inputs[0], output)
+        ctx.save_for_forward(inputs[0], output)
+
+    @staticmethod
+    def jvp(ctx, tangent: Tensor) -> Tensor:
+        return _change(*ctx.saved_tensors, tangent)
 
 
 def rotation_from_covariance(covariance: Tensor, *, reference: Tensor | None = None) -> Tensor:
@@ -116,4 +137,5 @@ def rotation_from_covariance(covariance: Tensor, *, reference: Tensor | None = N
     squared = (covariance * covariance).sum((-1, -2))
     floor = 1e-24 if covariance.dtype == torch.float32 else math.ulp(0.0) ** 0.5
     pull = PRIOR_STRENGTH * (squared + floor).sqrt()
-    return _NearestRotation.apply(covariance + pull[..., None, None] * reference)
+    function = _NearestRotationAnyWay if transformed() else _NearestRotation
+    return function.apply(covariance + pull[..., None, None] * reference)

@@ -8,6 +8,8 @@ import torch
 from torch import Tensor
 from torch.nn.functional import embedding_bag
 
+from soma_core.geometry.torch_func import transformed
+
 __all__ = ["Csr", "SparseRows", "gather_rows", "sparse_product"]
 
 Csr = tuple[Tensor, Tensor, Tensor]
@@ -39,12 +41,42 @@ class _Gather(torch.autograd.Function):
         return back, None, None, None, None, None, None
 
 
+class _GatherAnyWay(_Gather):
+    """The same for every transform of ``torch.func``, in any order."""
+
+    @staticmethod
+    def forward(dense, *matrix):
+        return sparse_product(matrix[:3], dense.contiguous())
+
+    @staticmethod
+    def setup_context(ctx, inputs, _output) -> None:
+        ctx.save_for_backward(*inputs[1:])
+        ctx.save_for_forward(*inputs[1:])
+
+    @staticmethod
+    def backward(ctx, grad):
+        matrix = ctx.saved_tensors
+        return _GatherAnyWay.apply(grad, *matrix[3:], *matrix[:3]), *[None] * 6
+
+    @staticmethod
+    def jvp(ctx, tangent, *_constant):
+        return _GatherAnyWay.apply(tangent, *ctx.saved_tensors)
+
+    @staticmethod
+    def vmap(_info, in_dims, dense, *matrix):
+        assert not any(dim is not None for dim in in_dims[1:]), "the matrix is constant"
+        dense = dense.movedim(in_dims[0], 2)
+        out = _GatherAnyWay.apply(dense.flatten(1), *matrix)
+        return out.unflatten(1, dense.shape[1:]), 2
+
+
 def gather_rows(dense: Tensor, matrix: Csr, transpose: Csr) -> Tensor:
     """Product of a sparse (m, n) matrix, given with its transpose, and a dense (n, f) one; (m, f).
 
     Differentiable in `dense` only; the transpose is read in the backward pass alone.
     """
-    return _Gather.apply(dense, *matrix, *transpose)
+    function = _GatherAnyWay if transformed() else _Gather
+    return function.apply(dense, *matrix, *transpose)
 
 
 class SparseRows(torch.nn.Module):

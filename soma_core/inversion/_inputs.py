@@ -6,8 +6,9 @@ import torch
 from torch import Tensor
 
 from soma_core.errors import InputError
+from soma_core.geometry.torch_func import transformed
 
-__all__ = ["check_vertices", "check_weights", "refuse_unit_error"]
+__all__ = ["check_vertices", "check_weights", "refuse_transforms", "refuse_unit_error"]
 
 _UNIT_FACTORS = (1000.0, 100.0, 10.0, 0.1, 0.01, 0.001)
 
@@ -49,6 +50,17 @@ def check_weights(weights: Tensor | None, default: Tensor, frames: int) -> Tenso
             fix="Use 0 for vertices to leave out.",
         )
     return weights if weights.ndim == 2 else weights[None]
+
+
+def refuse_transforms() -> None:
+    """Refuse to fit under ``torch.func`` or forward-mode differentiation."""
+    if transformed():
+        raise InputError(
+            "vertices",
+            got="tensors under a transform of torch.func, or of forward-mode differentiation",
+            expected="plain tensors: a fit is a loop with a reverse-mode derivative",
+            fix="Fit all frames as one batch, and use torch.autograd.grad or backward().",
+        )
 
 
 def refuse_unit_error(scale: Tensor) -> None:

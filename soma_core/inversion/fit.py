@@ -5,14 +5,15 @@ from __future__ import annotations
 import functools
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Literal, get_args
+from typing import TYPE_CHECKING, Literal, get_args
 
 import torch
 from torch import Tensor
 
+from soma_core._derived import Derived, own_precision
 from soma_core._inputs import check_bone_scale
 from soma_core.errors import InputError
-from soma_core.inversion._inputs import check_vertices, check_weights, refuse_unit_error
+from soma_core.inversion._inputs import check_vertices, check_weights, refuse_transforms, refuse_unit_error
 from soma_core.inversion.analytical import AnalyticalOptions
 from soma_core.inversion.autograd import AutogradOptions
 from soma_core.inversion.implicit import attach_gradient
@@ -73,7 +74,7 @@ class _Frames:
         )
 
 
-class PoseInversion(torch.nn.Module):
+class PoseInversion(Derived):
     """Recovers the rig's rotations from posed vertices; keeps no state between calls.
 
     The default ladder aligns every joint's own points, then takes Levenberg-Marquardt steps on the exact
@@ -108,8 +109,8 @@ class PoseInversion(torch.nn.Module):
         priors: PosePriors | None = None,
         kernels: Kernels = "auto",
     ) -> None:
-        super().__init__()
-        options = LadderOptions(
+        super().__init__(locals(), layer.device, layer.dtype)
+        self.options = LadderOptions(
             stages=stages, iterations=iterations, tolerance=tolerance, robust=robust,
             robust_rounds=robust_rounds, refreshes=refreshes, analytical=analytical or AnalyticalOptions(),
             autograd=autograd or AutogradOptions(),
@@ -118,28 +119,42 @@ class PoseInversion(torch.nn.Module):
             raise InputError(
                 "kernels", got=repr(kernels), expected="'auto', 'torch' or 'warp'", fix="Pass kernels='auto'."
             )
-        self.layer, self.priors = layer, priors or PosePriors()
+        self.layer, self.priors, self.kernels = layer, priors or PosePriors(), kernels
+        self._build(self.device, self.dtype)
+
+    def _build(self, device: torch.device, dtype: torch.dtype) -> None:
+        layer = self.layer.to(device, dtype)
+        self.device, self.dtype = device, dtype
         # Not measured on CUDA, where one thread would hold a whole frame: the dense reference runs there.
-        self.warp = warp = kernels == "warp" or (kernels == "auto" and layer.device.type == "cpu")
-        self.ladder = Ladder(layer, options, warp=warp)
-        kind = {"dtype": layer.dtype, "device": layer.device}
+        self.warp = self.kernels == "warp" or (self.kernels == "auto" and device.type == "cpu")
+        self.ladder = Ladder(layer, self.options, warp=self.warp)
+        kind = {"dtype": dtype, "device": device}
         names = layer.rig.joint_names
         variables = [names[j] for j in self.model.solver.variables.tolist()]
         self.terms = joint_terms(self.priors, variables, **kind)
         self.doubt = twist_doubt(self.priors, variables, **kind) if self.model.driven is not None else None
-        fitted = torch.as_tensor(self.model.fitted, device=layer.device)
-        self.register_buffer("default_weights", fitted.to(layer.dtype), persistent=False)
+        fitted = torch.as_tensor(self.model.fitted, device=device)
+        self.register_buffer("default_weights", fitted.to(dtype), persistent=False)
+        self.__dict__.pop("_to_canonical", None)
 
     @property
     def model(self) -> PoseModel:
         """The forward model that is fitted."""
         return self.ladder.model
 
+    def _follow(self) -> None:
+        """Derive everything again where the layer was moved or converted by itself."""
+        if (self.layer.device, self.layer.dtype) != (self.device, self.dtype):
+            self._build(self.layer.device, self.layer.dtype)
+
+    @own_precision
     def prepare(self, identity: Identity, weights: Tensor | None = None) -> RestMoments:
         """What a fit needs of an identity under vertex weights."""
+        self._follow()
         weights = check_weights(weights, self.default_weights, identity.batch_size)
         return self.model.rest(identity, weights)
 
+    @own_precision
     def forward(
         self,
         vertices: Tensor,
@@ -169,8 +184,9 @@ class PoseInversion(torch.nn.Module):
 
         Raises:
             InputError: a wrong shape, a negative weight or bone scale, or vertices in another unit than they
-                should be; a gradient asked for with `robust` or a temporal prior.
+                should be; a gradient asked for with `robust` or a temporal prior; ``torch.func`` around it.
         """
+        refuse_transforms()
         canonical = self.canonical(vertices, topology)
         with torch.no_grad():
             frames = self._frames(canonical.detach(), identity, weights, bone_scale, initial)
@@ -183,6 +199,9 @@ class PoseInversion(torch.nn.Module):
         if not (torch.is_grad_enabled() and canonical.requires_grad):
             return result
         return self._with_gradient(canonical, frames, result)
+
+    if TYPE_CHECKING:  # torch says that a module returns anything
+        __call__ = forward
 
     def _with_gradient(self, vertices: Tensor, frames: _Frames, result: InversionResult) -> InversionResult:
         if self.ladder.options.robust is not None or self.priors.temporal_strength:
@@ -255,8 +274,10 @@ class PoseInversion(torch.nn.Module):
             refuse_unit_error(torch.cat([scale for _, scale in fits]))
         return joined([result for result, _ in fits])
 
+    @own_precision
     def canonical(self, vertices: Tensor, topology: Topology) -> Tensor:
         """Vertices (F, v, 3) [m] on the layer's mesh from what :meth:`forward` takes."""
+        self._follow()
         layer = self.layer
         if topology == "native":
             vertices = check_vertices(vertices, -1, fix="Pass the backend's own vertices.")

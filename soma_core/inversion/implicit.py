@@ -84,7 +84,8 @@ class _Implicit(torch.autograd.Function):
         grads, states = [], []
         for first in range(0, len(valid), _CHUNK) or (0,):
             chunk = slice(first, first + _CHUNK)
-            moved, state = _pull_back(model, problem(chunk), *(one[chunk] for one in frames))
+            with torch.autocast(by_rotations.device.type, enabled=False):
+                moved, state = _pull_back(model, problem(chunk), *(one[chunk] for one in frames))
             grads.append(moved)
             states.append(state)
         _warn(torch.cat(states))

@@ -4,15 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import Any, get_args
+from typing import TYPE_CHECKING, Any, get_args
 
 import torch
 from torch import Tensor
 
+from soma_core._derived import Derived, own_precision
 from soma_core.backends.parameters import batch_parameters
 from soma_core.errors import InputError
 from soma_core.geometry.rotations import matrix_to_axis_angle
-from soma_core.inversion._inputs import check_weights
+from soma_core.inversion._inputs import check_weights, refuse_transforms
 from soma_core.inversion.implicit import attach_gradient
 from soma_core.layer import Kernels
 from soma_core.native.model import NativeBody, NativeRig
@@ -36,7 +37,7 @@ _PER_FRAME = (
 )  # fmt: skip
 
 
-class NativeFit:
+class NativeFit(Derived):
     """Recovers the pose parameters of a native model from posed SOMA bodies; keeps no state between calls.
 
     Canonical vertices go to the native topology, and the model's own pose is fitted to them: aligned
@@ -77,17 +78,23 @@ class NativeFit:
         kernels: Kernels = "auto",
         registry: Registry | None = None,
     ) -> None:
+        super().__init__(locals(), device, dtype)
         if kernels not in get_args(Kernels):
             raise InputError(
                 "kernels", got=repr(kernels), expected="'auto', 'torch' or 'warp'", fix="Pass kernels='auto'."
             )
         if iterations < 0:
             raise InputError("iterations", got=iterations, expected="at least 0", fix="Leave iterations out.")
-        self.device, self.dtype = torch.device(device), dtype
-        kind = {"device": self.device, "dtype": dtype}
-        registry = registry or default_registry()
+        self.backend, self.lod, self.kernels = backend, lod, kernels
+        self.options, self._registry = dict(options or {}), registry or default_registry()
         self.iterations, self.tolerance = iterations, tolerance
-        generator = registry.generator(backend, options=options, **kind)
+        self._build(self.device, dtype)
+
+    def _build(self, device: torch.device, dtype: torch.dtype) -> None:
+        self.device, self.dtype = device, dtype
+        kind = {"device": device, "dtype": dtype}
+        registry, backend = self._registry, self.backend
+        generator = registry.generator(backend, options=self.options, **kind)
         if not isinstance(generator, HasSkinning):
             raise InputError(
                 "backend",
@@ -96,13 +103,15 @@ class NativeFit:
                 fix="NativeTransfer gives its vertices.",
             )
         self._generator, self._isolated = generator, lambda: registry.isolated(backend, "rest")
-        self.transfer = NativeTransfer(backend, lod=lod, registry=registry, **kind)
+        self.transfer = NativeTransfer(backend, lod=self.lod, registry=registry, **kind)
         self.spec, self.scale = self.transfer.spec, METRES[self.transfer.spec.unit]
         covered = self.transfer.covered.cpu().numpy()
-        self.rig = NativeRig(self._model(self._one_body({})), self.scale, covered, kernels=kernels, **kind)
+        model = self._model(self._one_body({}))
+        self.rig = NativeRig(model, self.scale, covered, kernels=self.kernels, **kind)
         self.joint_names = self.rig.joint_names
 
-    def __call__(
+    @own_precision
+    def forward(
         self,
         vertices: Tensor,
         *,
@@ -123,13 +132,19 @@ class NativeFit:
             minimum, with the model's exact curvature); the report does not.
 
         Raises:
-            InputError: a wrong shape, a negative weight, or parameters of several bodies.
+            InputError: a wrong shape, a negative weight, parameters of several bodies, or a transform of
+                ``torch.func``.
         """
+        refuse_transforms()
         target = self._native(vertices)
         with torch.no_grad():
             fit = self._prepared(self._one_body(params), self._weights(weights))
         return _joined([self._fit(fit, part) for part in target.split(_CHUNK)])
 
+    if TYPE_CHECKING:  # torch says that a module returns anything
+        __call__ = forward
+
+    @own_precision
     @torch.no_grad()
     def fit_params(
         self,
@@ -146,7 +161,7 @@ class NativeFit:
         whole model. What the frames leave open stays at `start`.
 
         Args:
-            vertices, weights: as for :meth:`__call__`.
+            vertices, weights: as for :meth:`forward`.
             start: parameters to begin from; what is left out has its default.
             frames: how many frames, spread over the motion, to look at.
             iterations: largest number of steps.

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from soma_core.geometry.kabsch import rotation_from_covariance
 from soma_core.geometry.rotations import shortest_arc
+from soma_core.geometry.torch_func import transformed
 from soma_core.rig.skeleton import Rig
 
 __all__ = ["AlignmentPlan", "alignment_plan", "fit_rotations"]
@@ -102,7 +103,7 @@ class RotationFit(torch.nn.Module):
 
     def forward(self, joints: Tensor, covariances: Tensor) -> Tensor:
         """World rotations (B, J, 3, 3) from joint positions (B, J, 3) and covariances (B, J, 3, 3)."""
-        if self.warp:
+        if self.warp and not transformed():
             from soma_core.kernels.skeleton_fit_wp import fit_displacements
 
             displacement = fit_displacements(joints, covariances, self.bind, self.pivots, self.child_table)

@@ -175,14 +175,19 @@ GRADIENT_SPECTRA = [
 ]
 
 
+@pytest.mark.filterwarnings("ignore:.*torch.jit.script. is deprecated:DeprecationWarning")
 @pytest.mark.parametrize(("singular", "sign"), GRADIENT_SPECTRA)
 def test_gradcheck(singular, sign):
     given = covariance(singular, sign, count=3, seed=20).requires_grad_()
     # The smallest gap bounds the curvature, so it sets the step of the finite differences.
     gap = singular[1] + sign * singular[2]
     assert torch.autograd.gradcheck(
-        rotation_from_covariance, given, eps=1e-6 * gap, atol=1e-5 / gap, rtol=1e-4
+        rotation_from_covariance, given, eps=1e-6 * gap, atol=1e-5 / gap, rtol=1e-4, check_forward_ad=True
     )
+    each = torch.func.vmap(torch.func.jacfwd(rotation_from_covariance))(given.detach())
+    whole = torch.func.jacrev(rotation_from_covariance)(given.detach())
+    own = torch.stack([whole[k, :, :, k] for k in range(3)])
+    torch.testing.assert_close(each, own, atol=1e-9 / gap, rtol=0)
 
 
 def test_gradcheck_on_the_scale_of_a_finger():

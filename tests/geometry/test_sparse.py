@@ -44,9 +44,17 @@ def test_equals_the_dense_product(width, dtype):
     torch.testing.assert_close(given.grad, twin.grad, atol=ROUNDING[dtype], rtol=0)
 
 
+@pytest.mark.filterwarnings("ignore:.*torch.jit.script. is deprecated:DeprecationWarning")
 def test_gradcheck():
     operator = SparseRows(matrix()[0], dtype=torch.float64, device=CPU)
-    assert torch.autograd.gradcheck(operator, randn(20, 2, seed=3).requires_grad_())
+    given = randn(20, 2, seed=3).requires_grad_()
+    assert torch.autograd.gradcheck(operator, given, check_forward_ad=True)
+    many = randn(3, 20, 2, seed=4)
+    torch.testing.assert_close(torch.func.vmap(operator)(many), torch.stack([operator(one) for one in many]))
+    curved = torch.func.hessian(lambda dense: operator(dense).square().sum() / 2)(many[0])
+    dense = torch.as_tensor(matrix()[0].toarray())
+    expected = torch.einsum("va,vb,fg->afbg", dense, dense, torch.eye(2, dtype=torch.float64))
+    torch.testing.assert_close(curved, expected)
 
 
 def test_backward_accepts_gradients_that_are_not_contiguous():

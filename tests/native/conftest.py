@@ -11,7 +11,6 @@ from soma_backend_smpl import smplx
 from soma_core import SomaLayer, read_motion
 from soma_core.native import NativeFit
 from soma_core.paths import assets_dir
-from soma_core.plugin.registry import Registry
 from tests.standins.smpl_files import smpl_arrays, write_npz, write_smpl_wrap
 
 FRAMES = (0, 90, 170, 260)
@@ -19,16 +18,15 @@ BETAS = (0.8, -0.5, 0.4, 0.3)
 
 
 @pytest.fixture(scope="session")
-def _smplx(tmp_path_factory) -> tuple[SomaLayer, NativeFit]:
-    """Both ways of the stand-in; the data folder is looked at while they are built."""
+def _smplx(tmp_path_factory) -> tuple[SomaLayer, NativeFit, Path]:
+    """Both ways of the stand-in, and its data folder, which is looked at while they are built."""
     root: Path = tmp_path_factory.mktemp("data")
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("SOMA_DATA_DIR", str(root))
         official = write_npz(root / "official" / "SMPLX_NEUTRAL.npz", smpl_arrays("smplx", width=20))
         smplx.soma_convert(official, None)
         write_smpl_wrap(root, "smplx")
-        registry = Registry()
-        return SomaLayer("smplx", registry=registry), NativeFit("smplx", registry=registry)
+        return SomaLayer("smplx"), NativeFit("smplx"), root
 
 
 @pytest.fixture(scope="session")
@@ -41,6 +39,12 @@ def layer(_smplx):
 def fit(_smplx):
     """The way back to SMPL-X."""
     return _smplx[1]
+
+
+@pytest.fixture
+def data(_smplx, monkeypatch):
+    """The data folder, for building once more."""
+    monkeypatch.setenv("SOMA_DATA_DIR", str(_smplx[2]))
 
 
 @pytest.fixture(scope="session")

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import pickle
+
 import numpy as np
 import pytest
 import torch
@@ -130,6 +132,25 @@ def test_refusals(fit, vertices):
         fit.fit_params(vertices * torch.nan)
     with pytest.raises(InputError, match=r"weights: got \(7,\)"):
         fit(vertices, weights=torch.ones(7))
+
+
+@pytest.mark.usefixtures("data")
+def test_it_is_a_module_like_any_other(fit, vertices):
+    """Pickled, converted, in a cast network and under autocast: the same bits as one made so."""
+    given = vertices[:1]
+
+    def same(one, other):
+        for name in ("rotations", "translation", "vertices"):
+            torch.testing.assert_close(getattr(one, name), getattr(other, name), atol=0, rtol=0)
+
+    other = pickle.loads(pickle.dumps(fit))
+    network = torch.nn.Sequential(torch.nn.Linear(2, 2), other).to(torch.bfloat16)
+    assert set(network.state_dict()) == {"0.weight", "0.bias"}
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        same(other(given), fit(given))
+    same(other.double()(given), NativeFit("smplx", dtype=torch.float64)(given))
+    with pytest.raises(InputError, match="vertices: got tensors under a transform of torch.func"):
+        torch.func.vmap(fit)(given[None])
 
 
 def test_gradients_reach_the_canonical_vertices(fit, vertices, motion):

@@ -1,0 +1,96 @@
+"""Modules whose constants are derived for one device and dtype, and what torch's transforms ask of them."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable, Mapping
+from typing import Any, Self, TypeVar, cast
+
+import torch
+from torch import Tensor
+
+from soma_core._inputs import check_choice
+
+__all__ = ["Derived", "own_precision"]
+
+_DTYPES = (torch.float32, torch.float64)
+_Method = TypeVar("_Method", bound=Callable[..., Any])
+
+
+class Derived(torch.nn.Module):
+    """A module that is what it was made from: its constants are derived in float64, and never cast.
+
+    Moved or converted, by itself or inside a network, it derives them again. A network that is cast to half
+    precision, or taken to the meta device, leaves it as it is. Copies and pickles hold what it was made from,
+    and derive it anew.
+
+    Args:
+        given: arguments of the constructor; others that are in it, such as `self`, do not matter.
+        device, dtype: of all constants and results.
+
+    Raises:
+        InputError: neither float32 nor float64.
+    """
+
+    def __init__(self, given: Mapping[str, Any], device: torch.device | str, dtype: torch.dtype) -> None:
+        super().__init__()
+        check_choice("dtype", dtype, _DTYPES)
+        self._given = {
+            name: dict(value) if isinstance(value, Mapping) else value
+            for name, value in given.items()
+            if name not in ("self", "__class__")
+        }
+        self.device, self.dtype = torch.device(device), dtype
+
+    def _build(self, device: torch.device, dtype: torch.dtype) -> None:
+        """Derive all constants, in place of those that are there."""
+        raise NotImplementedError
+
+    def _apply(self, fn, recurse=True):  # noqa: ARG002 - PyTorch's signature
+        here = torch.empty(0, dtype=self.dtype, device=self.device)
+        there = fn(here)
+        dtype = there.dtype if there.dtype in _DTYPES else self.dtype
+        if not there.is_meta and (there.device, dtype) != (here.device, here.dtype):
+            self._build(there.device, dtype)
+        return self
+
+    def to(self, *args: Any, **kwargs: Any) -> Self:
+        """Move or convert in place; takes what ``torch.nn.Module.to`` does.
+
+        Raises:
+            InputError: a dtype other than float32 and float64. Networks around it may have any.
+        """
+        for value in (*args, *kwargs.values()):
+            kind = value.dtype if isinstance(value, Tensor) else value
+            if isinstance(kind, torch.dtype):
+                check_choice("dtype", kind, _DTYPES)
+        return super().to(*args, **kwargs)
+
+    def half(self) -> Self:
+        """Refused, as in :meth:`to`."""
+        return self.to(torch.float16)
+
+    def bfloat16(self) -> Self:
+        """Refused, as in :meth:`to`."""
+        return self.to(torch.bfloat16)
+
+    def __reduce__(self):
+        kind = {"device": self.device, "dtype": self.dtype}
+        given = self._given | {name: value for name, value in kind.items() if name in self._given}
+        # copy.deepcopy copies these, which come first, and shares what the function holds, such as meshes.
+        modules = {name: value for name, value in given.items() if isinstance(value, torch.nn.Module)}
+        rest = {name: value for name, value in given.items() if name not in modules}
+        return functools.partial(type(self), **rest), tuple(modules.values()), {"training": self.training}
+
+
+def own_precision(method: _Method) -> _Method:
+    """Compute a method in its module's own precision, whatever ``torch.autocast`` says around it."""
+
+    @functools.wraps(method)
+    def exact(self, *args, **kwargs):
+        if not torch.is_autocast_enabled(self.device.type):
+            return method(self, *args, **kwargs)
+        with torch.autocast(self.device.type, enabled=False):
+            return method(self, *args, **kwargs)
+
+    return cast(_Method, exact)

@@ -1,0 +1,21 @@
+"""Whether a derivative or a batch of another kind than reverse mode is at work."""
+
+from __future__ import annotations
+
+import torch
+from torch.autograd import forward_ad
+
+__all__ = ["transformed"]
+
+
+def transformed() -> bool:
+    """Whether ``torch.func`` or forward-mode differentiation is at work, outside ``torch.compile``.
+
+    Operators that torch knows from outside have reverse-mode derivatives alone, and forward mode takes their
+    results for constants without a word; plain torch stands in for them then. torch.compile in turn takes
+    no function that has a forward-mode derivative of its own. (Both: torch 2.4 to 2.13, which have no public
+    question either.)
+    """
+    if torch.compiler.is_compiling():
+        return False
+    return forward_ad._current_level >= 0 or torch._C._are_functorch_transforms_active()
