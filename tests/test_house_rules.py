@@ -15,7 +15,8 @@ import soma_core
 from soma_core.plugin import hookspecs
 
 ROOT = Path(__file__).resolve().parents[1]
-SOURCES = sorted([*ROOT.glob("soma_core/**/*.py"), *ROOT.glob("plugins/*/soma_backend_*/**/*.py")])
+_FOLDERS = ("soma_core/**/*.py", "plugins/*/soma_backend_*/**/*.py", "assets/make/*.py")
+SOURCES = sorted(path for pattern in _FOLDERS for path in ROOT.glob(pattern))
 
 MODULE_LINES = 400
 FUNCTION_LINES = 60

@@ -13,6 +13,7 @@ from soma_core.errors import AssetError
 from soma_core.files import refuse_unreadable
 from soma_core.rig.expansion import public_rig, with_helpers
 from soma_core.rig.influences import read_weights
+from soma_core.rig.manifest import RESTORE
 from soma_core.rig.mesh import Lod
 from soma_core.rig.procedural import ProceduralDefinition
 from soma_core.rig.skeleton import Rig
@@ -73,7 +74,7 @@ class _Skeleton:
 def _open(path: Path) -> Usd.Stage:
     from pxr import Tf, Usd
 
-    refuse_unreadable(path, fix="Restore the file, or make it again with `soma assets build`")
+    refuse_unreadable(path, fix=RESTORE)
     try:
         return Usd.Stage.Open(str(path))
     except Tf.ErrorException as error:

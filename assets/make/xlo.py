@@ -11,11 +11,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from assets.make.caricature import BoundSkin, draw_caricature
+from assets.make.texture_transfer import transfer_texture
 from soma_core.errors import SomaError
 from soma_core.geometry.barycentric import closest_point_on_triangle, raised_normal, tetrahedral_coordinates
-from soma_core.rig.caricature import BoundSkin, draw_caricature
-from soma_core.rig.subdivision import split_polygons
-from soma_core.rig.texture_transfer import transfer_texture
+from soma_core.geometry.mesh import split_polygons
 from soma_core.topology.closest import ClosestFaces
 from soma_core.topology.fill import build_fill
 

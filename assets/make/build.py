@@ -12,9 +12,17 @@ from typing import Any
 import numpy as np
 import scipy.sparse
 
+from assets.make.neutral import compress_shape_space, write_neutral
+from assets.make.segments import RiggedMesh, label_segments
+from assets.make.source import SOURCE_SHA256, SourceRig, read_source
+from assets.make.subdivision import LowMesh, recover_low
+from assets.make.symmetry import mirror_vertices
+from assets.make.twist_template import procedural_document
+from assets.make.usd_text import SkinMeshText, rig_text
+from assets.make.xlo import LowSkin, XloSkin, make_xlo
 from soma_core.cache import atomic_write, file_sha256
 from soma_core.errors import AssetError
-from soma_core.rig.compression import compress_shape_space
+from soma_core.geometry.mesh import split_polygons
 from soma_core.rig.expansion import helper_transforms
 from soma_core.rig.manifest import (
     CORRECTIVES_NAME,
@@ -24,21 +32,14 @@ from soma_core.rig.manifest import (
     Manifest,
     write_manifest,
 )
-from soma_core.rig.neutral import SEGMENT_NAMES, ShapeSpace, load_shape_space, write_neutral
+from soma_core.rig.neutral import SEGMENT_NAMES, ShapeSpace, load_shape_space
 from soma_core.rig.procedural import ProceduralDefinition
 from soma_core.rig.procedural_json import parse_procedural
 from soma_core.rig.revision import REVISION_DIGITS, rig_hash
-from soma_core.rig.segments import RiggedMesh, label_segments
-from soma_core.rig.source import SOURCE_SHA256, SourceRig, read_source
-from soma_core.rig.subdivision import LowMesh, recover_low, split_polygons
-from soma_core.rig.symmetry import mirror_vertices
 from soma_core.rig.transforms import local_transforms, world_transforms
-from soma_core.rig.twist_template import procedural_document
 from soma_core.rig.twist_weights import spread_weights
-from soma_core.rig.usd_text import SkinMeshText, rig_text
-from soma_core.rig.xlo import LowSkin, XloSkin, make_xlo
 
-__all__ = ["build_assets"]
+__all__ = ["build_rig"]
 
 _log = logging.getLogger(__name__)
 
@@ -206,6 +207,7 @@ def _usda(built: _Built) -> str:
         rest_local=local_transforms(rest, parents),
         meshes=[_skin(built, "mid"), _skin(built, "low"), _xlo_skin(built)],
         notes={"licence": _LICENCE, "origin": _ORIGIN, "rig_hash": built.rig_hash},
+        # Part of the shipped bytes, as it was first written.
         comment="Canonical SOMA rig with its twist joints; restTransforms hold the T-pose. "
         "Written by soma assets build.",
     )
@@ -285,7 +287,7 @@ def _found_entries(output: Path, built: _Built) -> dict[str, dict[str, Any]]:
     return entries
 
 
-def build_assets(output: Path, shape_space: Path | None = None) -> Manifest:
+def build_rig(output: Path, shape_space: Path | None = None) -> Manifest:
     """Write the rig, the neutral asset and the manifest into `output`; the same input, the same bytes.
 
     Args:
