@@ -9,6 +9,8 @@ from __future__ import annotations
 import importlib
 from typing import TYPE_CHECKING, Any
 
+from soma_core._version import __version__
+
 if TYPE_CHECKING:
     from soma_core.animation.posed import Posed
     from soma_core.errors import AssetError, InputError, SomaError
@@ -21,8 +23,6 @@ if TYPE_CHECKING:
     from soma_core.plugin.spec import BackendSpec, Generator, LinearBasis, Parameter, WrapPair
     from soma_core.rig import load_canonical
     from soma_core.skeleton.identity import Identity
-
-__version__ = "0.1.0"
 
 __all__ = [
     "AssetError",

@@ -16,7 +16,7 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from soma_core.testing.conformance import Check, CheckFailedError, Level, check
+    from soma_core.plugin.check import Check, CheckFailedError, Level, check
     from soma_core.testing.context import Context
     from soma_core.testing.report import Report
     from soma_core.testing.run import check_backend
@@ -34,14 +34,14 @@ __all__ = [
 ]
 
 _HOME = {
-    "Check": "conformance",
-    "CheckFailedError": "conformance",
-    "Context": "context",
-    "Level": "conformance",
-    "Report": "report",
-    "check": "conformance",
-    "check_backend": "run",
-    "conformance_suite": "suite",
+    "Check": "soma_core.plugin.check",
+    "CheckFailedError": "soma_core.plugin.check",
+    "Context": "soma_core.testing.context",
+    "Level": "soma_core.plugin.check",
+    "Report": "soma_core.testing.report",
+    "check": "soma_core.plugin.check",
+    "check_backend": "soma_core.testing.run",
+    "conformance_suite": "soma_core.testing.suite",
 }
 
 
@@ -49,4 +49,4 @@ def __getattr__(name: str) -> Any:
     """Load a public name on first use (PEP 562)."""
     if name not in _HOME:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}; it offers {', '.join(__all__)}")
-    return getattr(importlib.import_module(f"{__name__}.{_HOME[name]}"), name)
+    return getattr(importlib.import_module(_HOME[name]), name)
