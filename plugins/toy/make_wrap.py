@@ -15,8 +15,7 @@ import scipy.sparse
 from soma_backend_toy._figure import SEGMENTS, Segment, figure, figure_triangles
 
 from soma_core import load_canonical
-from soma_core.geometry.barycentric import closest_point_on_triangle
-from soma_core.topology.closest import ClosestFaces
+from soma_core.plugin import ClosestFaces, closest_point_on_triangle
 
 FOLDER = Path(__file__).parent / "soma_backend_toy"
 TO_NATIVE = 100 * np.array([[1, 0, 0], [0, 0, -1], [0, 1, 0]])  # metres, +Y up, facing +Z, to the toy's frame

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import pluggy
 
-from soma_core.plugin.check import Check
+from soma_core.plugin.checks import Check
 from soma_core.plugin.spec import BackendSpec, Generator
 
 if TYPE_CHECKING:

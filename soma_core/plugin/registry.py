@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, Literal
 from soma_core._version import __version__
 from soma_core.errors import InputError
 from soma_core.plugin.causes import cause_and_fix, remedy, supply
-from soma_core.plugin.check import Check
+from soma_core.plugin.checks import Check
 from soma_core.plugin.configs import PluginConfigs, find_configs
 from soma_core.plugin.declaration import checks_problem, did_you_mean, spec_problem
 from soma_core.plugin.discovery import CORE_DISTRIBUTION, EntryPointLike, Offer, find_offers

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from soma_core.errors import AssetError, InputError
-from soma_core.plugin.check import Check, CheckFailedError, Level
+from soma_core.plugin.checks import Check, CheckFailedError, Level
 from soma_core.plugin.declaration import did_you_mean
 from soma_core.plugin.errors import BackendError, BrokenBackendError
 from soma_core.plugin.registry import Registry, default_registry

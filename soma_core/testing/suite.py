@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from soma_core.errors import SomaError
-from soma_core.plugin.check import CheckFailedError, Level
+from soma_core.plugin.checks import CheckFailedError, Level
 from soma_core.plugin.registry import Registry
 from soma_core.rig.mesh import CanonicalMesh
 from soma_core.rig.skeleton import Rig

@@ -13,10 +13,8 @@ from pathlib import Path
 
 import numpy as np
 
-from soma_core.cache import atomic_write, file_sha256
-from soma_core.errors import AssetError
-from soma_core.files import refuse_unreadable
-from soma_core.npz import open_npz_file
+from soma_core import AssetError
+from soma_core.plugin import atomic_write, file_sha256, open_npz_file, refuse_unreadable
 
 __all__ = ["COMPONENTS", "VERTICES", "PointSpace", "read_npz", "read_pca", "write_npz"]
 

@@ -13,9 +13,16 @@ import numpy as np
 from soma_backend_smpl._files import SUFFIXES, canonical_path, find_models, gender_of, wrap_paths
 from soma_backend_smpl._model_file import ModelFile, read_model, shape_width
 from soma_backend_smpl.family import FAMILIES, Family
-from soma_core.cache import atomic_write, file_sha256
-from soma_core.errors import AssetError, InputError
-from soma_core.plugin.spec import BackendSpec, FileNeeded, Generator, Parameter, WrapPair
+from soma_core import AssetError, InputError
+from soma_core.plugin import (
+    BackendSpec,
+    FileNeeded,
+    Generator,
+    Parameter,
+    WrapPair,
+    atomic_write,
+    file_sha256,
+)
 
 if TYPE_CHECKING:
     import torch

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from soma_core.plugin.check import Check
+from soma_core.plugin.checks import Check
 from soma_core.testing.checks import (
     agreement,
     behaviour,

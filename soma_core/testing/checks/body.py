@@ -6,7 +6,7 @@ import itertools
 
 import numpy as np
 
-from soma_core.plugin.check import CheckFailedError, check
+from soma_core.plugin.checks import CheckFailedError, check
 from soma_core.plugin.spec import Axis
 from soma_core.testing.context import Context
 

@@ -9,7 +9,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from soma_core.geometry.barycentric import closest_point_on_triangle
-from soma_core.plugin.check import CheckFailedError, check
+from soma_core.plugin.checks import CheckFailedError, check
 from soma_core.testing.context import Context
 from soma_core.topology.closest import ClosestFaces
 from soma_core.topology.wrap_pair import canonical_edges

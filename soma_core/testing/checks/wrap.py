@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from soma_core.plugin.check import CheckFailedError, check
+from soma_core.plugin.checks import CheckFailedError, check
 from soma_core.testing.context import Context
 from soma_core.topology.wrap_pair import canonical_edges, check_count, check_faces, check_order
 
