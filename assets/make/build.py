@@ -20,7 +20,7 @@ from assets.make.symmetry import mirror_vertices
 from assets.make.twist_template import procedural_document
 from assets.make.usd_text import SkinMeshText, rig_text
 from assets.make.xlo import LowSkin, XloSkin, make_xlo
-from soma_core.cache import atomic_write, file_sha256
+from soma_core.cache import atomic_text, file_sha256
 from soma_core.errors import AssetError
 from soma_core.geometry.mesh import split_polygons
 from soma_core.rig.expansion import helper_transforms
@@ -301,9 +301,9 @@ def build_rig(output: Path, shape_space: Path | None = None) -> Manifest:
     built = _derive(read_source())
     space = _shape_space(built, output, shape_space)
     text = _usda(built)
-    atomic_write(output / RIG_NAME, lambda temporary: temporary.write_text(text, encoding="utf-8"))
+    atomic_text(output / RIG_NAME, text)
     definition = json.dumps(procedural_document(built.source.joint_names), indent=1) + "\n"
-    atomic_write(output / PROCEDURAL_NAME, lambda temporary: temporary.write_text(definition, "utf-8"))
+    atomic_text(output / PROCEDURAL_NAME, definition)
     write_neutral(output / NEUTRAL_NAME, built.topology, space, _metadata(built))
     counts = {
         "joints": len(built.source.joint_names),

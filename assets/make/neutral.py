@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from soma_core.cache import atomic_write
+from soma_core.cache import atomic_arrays
 from soma_core.errors import InputError
 from soma_core.rig.neutral import TOPOLOGY_KEYS, ShapeSpace
 
@@ -84,4 +84,4 @@ def write_neutral(
     }
     arrays["metadata"] = np.array(text)
     ordered = {name: arrays[name] for name in sorted(arrays)}
-    atomic_write(path, lambda temporary: np.savez_compressed(temporary, **ordered))
+    atomic_arrays(path, ordered)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -79,11 +80,11 @@ class _NearestRotation(torch.autograd.Function):
         return _nearest_rotation(covariance)
 
     @staticmethod
-    def setup_context(ctx, inputs, output) -> None:
+    def setup_context(ctx: Any, inputs: tuple[Tensor], output: Tensor) -> None:
         ctx.save_for_backward(inputs[0], output)
 
     @staticmethod
-    def backward(ctx, grad: Tensor) -> Tensor:
+    def backward(ctx: Any, grad: Tensor) -> Tensor:
         covariance, rotation = ctx.saved_tensors
         stretch = rotation.transpose(-1, -2) @ covariance
         stretch = 0.5 * (stretch + stretch.transpose(-1, -2))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import scipy.sparse
 import torch
@@ -26,15 +28,15 @@ class _Gather(torch.autograd.Function):
     """``out = A @ dense`` with constant A; the backward pass applies the transpose, row by row."""
 
     @staticmethod
-    def forward(dense, crow, col, val, _t_crow, _t_col, _t_val):
+    def forward(dense: Tensor, crow: Tensor, col: Tensor, val: Tensor, *_transpose: Tensor) -> Tensor:
         return sparse_product((crow, col, val), dense)
 
     @staticmethod
-    def setup_context(ctx, inputs, _output) -> None:
+    def setup_context(ctx: Any, inputs: tuple[Tensor, ...], _output: Tensor) -> None:
         ctx.save_for_backward(*inputs[4:])
 
     @staticmethod
-    def backward(ctx, grad):
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
         back = sparse_product(ctx.saved_tensors, grad.contiguous())
         return back, None, None, None, None, None, None
 
@@ -53,6 +55,13 @@ class SparseRows(torch.nn.Module):
     ``operator(dense)`` computes the (m, f) product with a contiguous dense (n, f) matrix. Sums run in
     index order on every device, so results are deterministic.
     """
+
+    crow: Tensor
+    col: Tensor
+    val: Tensor
+    t_crow: Tensor
+    t_col: Tensor
+    t_val: Tensor
 
     def __init__(
         self, matrix: scipy.sparse.sparray, *, dtype: torch.dtype, device: torch.device | str

@@ -168,8 +168,8 @@ def _triangle_corners(mesh: CanonicalMesh) -> np.ndarray:
     for row, (a, b, c) in enumerate(mesh.triangles.tolist()):
         owners = [edge_face.get(edge) for edge in (a * size + b, b * size + c, c * size + a)]
         owner = next((found for found in owners if found is not None), None)
-        places = [corner_of.get(owner * size + v) if owner is not None else None for v in (a, b, c)]
-        if None in places:
+        places = [-1 if owner is None else corner_of.get(owner * size + v, -1) for v in (a, b, c)]
+        if min(places) < 0:
             raise InputError(
                 "mesh.triangles",
                 got=f"triangle {row} ({a}, {b}, {c})",

@@ -60,9 +60,11 @@ def find_starts(
         )
     surfaces = [skin.surface(frame) for frame in frames]
     tried = [(*each, *body) for each in zip(surfaces, frames, strict=True) for body in bodies]
-    costs = [_start(*each, model, _ROUGHLY).cost for each in tried]
+    costs = [_start(*each, model=model, samples=_ROUGHLY).cost for each in tried]
     best = [tried[index] for index in np.argsort(costs, kind="stable")[: max(_LEFT, count)]]
-    return sorted((_start(*each, model, _SAMPLES) for each in best), key=lambda start: start.cost)[:count]
+    return sorted((_start(*each, model=model, samples=_SAMPLES) for each in best), key=lambda s: s.cost)[
+        :count
+    ]
 
 
 def _mean_body(model: BodyModel, pose: BodyPose) -> Surface:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from soma_core.cache import atomic_write, file_sha256
+from soma_core.cache import atomic_text, file_sha256
 from soma_core.errors import AssetError
 from soma_core.files import refuse_unreadable
 
@@ -82,7 +82,7 @@ def write_manifest(root: Path, manifest: Manifest) -> None:
         "files": {name: dict(entry) for name, entry in manifest.files.items()},
     }
     text = json.dumps(content, indent=2, sort_keys=True) + "\n"
-    atomic_write(root / MANIFEST_NAME, lambda temporary: temporary.write_text(text, encoding="utf-8"))
+    atomic_text(root / MANIFEST_NAME, text)
 
 
 def verified_sha256(root: Path, manifest: Manifest, name: str) -> str:

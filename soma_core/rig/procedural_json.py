@@ -68,7 +68,7 @@ class _Field:
             raise self.refuse("a non-empty array")
         return [self.at(index) for index in range(len(self.value))]
 
-    def one_of(self, choices: Sequence[str], meaning: str) -> str:
+    def one_of(self, choices: Sequence[str], meaning: str) -> Any:
         """The value as one of the given texts."""
         if not isinstance(self.value, str) or self.value not in choices:
             raise self.refuse(meaning)

@@ -29,7 +29,7 @@ def _inverse_affine(matrix: _Matrix) -> _Matrix:
     determinant = sum(a[0][j] * cofactor[0][j] for j in range(3))
     linear = [[cofactor[j][i] / determinant for j in range(3)] for i in range(3)]
     shift = [-sum(linear[i][j] * matrix[j][3] for j in range(3)) for i in range(3)]
-    return [[*linear[i], shift[i]] for i in range(3)] + [[Fraction(0)] * 3 + [Fraction(1)]]
+    return [[*linear[i], Fraction(shift[i])] for i in range(3)] + [[Fraction(0)] * 3 + [Fraction(1)]]
 
 
 def local_transforms(world: np.ndarray, parents: np.ndarray) -> np.ndarray:

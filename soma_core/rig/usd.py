@@ -251,7 +251,7 @@ def _read_stored(path: Path, stage: Usd.Stage, skin: Usd.Prim) -> StoredRig:
     """The skeleton with the points and weights of a skin, in the unit and axes of the file."""
     from pxr import UsdGeom
 
-    up = str(UsdGeom.GetStageUpAxis(stage))
+    up = UsdGeom.GetStageUpAxis(stage)
     if up not in ("Y", "Z"):
         raise AssetError(path, cause=f"upAxis is {up}, expected Y or Z", fix="Export it again with +Y up")
     skeleton = _read_skeleton(path, _skeleton_prim(path, stage, skin))

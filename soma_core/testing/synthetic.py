@@ -138,14 +138,14 @@ def _surface_net(step: float, turn: np.ndarray) -> tuple[np.ndarray, np.ndarray]
     ticks = [step * np.arange(-count, count + 1) for count in reach]
     nodes = np.stack(np.meshgrid(*ticks, indexing="ij"), -1)
     inside = _distance(nodes @ turn.T + _CENTRE)[0] < 0
-    quads = []
+    found = []
     for axis in range(3):
         leaves = np.diff(inside.astype(np.int8), axis=axis)
         first, second = np.eye(3, dtype=int)[[(axis + 1) % 3, (axis + 2) % 3]]
         for sign in (-1, 1):  # grid edges that leave the body, then those that enter it
             cell = np.argwhere(leaves == sign)
-            quads.append(np.stack([cell, cell - first, cell - first - second, cell - second][::-sign], 1))
-    cells, ids = np.unique(np.concatenate(quads).reshape(-1, 3), axis=0, return_inverse=True)
+            found.append(np.stack([cell, cell - first, cell - first - second, cell - second][::-sign], 1))
+    cells, ids = np.unique(np.concatenate(found).reshape(-1, 3), axis=0, return_inverse=True)
     quads = ids.reshape(-1, 4)
     vertices = step * (cells + 0.5 - reach) @ turn.T + _CENTRE
     for _ in range(_SMOOTHINGS):  # evens the spacing: towards the neighbours, then back to the surface

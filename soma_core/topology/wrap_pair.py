@@ -120,7 +120,7 @@ def check_faces(triangles: np.ndarray, mesh: CanonicalMesh, *, path: Path) -> No
     """Refuse faces that are no part of a canonical polygon; its diagonals are free."""
     canonical = _canonical_edges(mesh)
     keys = [_edge_keys(triangles[:, i], triangles[:, j]) for i, j in ((0, 1), (1, 2), (2, 0))]
-    on_edges = sum(np.isin(key, canonical).astype(int) for key in keys)
+    on_edges = np.sum([np.isin(key, canonical) for key in keys], axis=0)
     strange = int((on_edges < 2).sum())
     if strange:
         raise InputError(

@@ -94,5 +94,5 @@ def soma_convert(source: Path, output: Path | None) -> Sequence[Path]:
     write_npz(target, read_pca(source), source=source)
     if native.exists() or not mean.is_file():
         return [target]
-    atomic_write(native, lambda temporary: shutil.copyfile(mean, temporary) and None)
+    atomic_write(native, lambda temporary: shutil.copyfile(mean, temporary))
     return [target, native]

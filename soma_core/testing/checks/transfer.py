@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+from typing import Any
 
 import numpy as np
 import torch
@@ -100,7 +101,7 @@ def transfer_random(context: Context) -> None:
 @check("similarity-equivariant", needs=("transfer-neutral", "transfer-random"))
 def similarity_equivariant(context: Context) -> None:
     """Turning, scaling and moving the native body does the same to the canonical one."""
-    transfer = copy.deepcopy(context.layer.rest_shape.transfer).float()
+    transfer: Any = copy.deepcopy(context.layer.rest_shape.transfer).float()
     frame = context.native_frame
     turn = torch.as_tensor(Rotation.from_rotvec([0.9, -0.5, 0.7]).as_matrix())
     native_turn = torch.as_tensor(np.linalg.inv(frame)) @ turn @ torch.as_tensor(frame)
