@@ -24,6 +24,7 @@ from soma_core.cache import atomic_text, file_sha256
 from soma_core.errors import AssetError
 from soma_core.geometry.mesh import split_polygons
 from soma_core.rig.expansion import helper_transforms
+from soma_core.rig.influences import padded_influences
 from soma_core.rig.manifest import (
     CORRECTIVES_NAME,
     NEUTRAL_NAME,
@@ -146,15 +147,6 @@ def _low_skin(source: SourceRig, low: LowMesh, mirror: np.ndarray) -> LowSkin:
     )
 
 
-def _influences(weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Every non-zero influence as (v, k) joints and weights, strongest first, padded with zeros."""
-    width = int((weights != 0).sum(axis=1).max())
-    joints = np.argsort(-weights, axis=1, kind="stable")[:, :width].astype(np.int32)
-    values = np.take_along_axis(weights, joints, axis=1).astype(np.float32)
-    joints[values == 0] = 0
-    return joints, values
-
-
 def _skin(built: _Built, lod: str) -> SkinMeshText:
     """One LOD of the skin; the low one takes its points, weights and UVs from the mid one."""
     source, topology = built.source, built.topology
@@ -162,7 +154,7 @@ def _skin(built: _Built, lod: str) -> SkinMeshText:
     uv, uv_indices = source.uv, source.uv_quads.reshape(-1)
     if lod == "low":
         uv, uv_indices = _low_texture(source, built.low)
-    joints, weights = _influences(built.weights)
+    joints, weights = padded_influences(scipy.sparse.csr_array(built.weights))
     return SkinMeshText(
         name="c_skin_mid" if lod == "mid" else "c_skin_lo",
         points=source.bind_shape[:count].astype(np.float32),
@@ -170,8 +162,8 @@ def _skin(built: _Built, lod: str) -> SkinMeshText:
         face_vert_counts=topology["face_vert_counts" + suffix],
         uv=uv,
         uv_indices=uv_indices,
-        joint_indices=joints[:count],
-        joint_weights=weights[:count],
+        joint_indices=joints[:count].astype(np.int32),
+        joint_weights=weights[:count].astype(np.float32),
     )
 
 
@@ -179,7 +171,7 @@ def _xlo_skin(built: _Built) -> SkinMeshText:
     """The extra-low skin, its weights spread over the helpers by its own points."""
     xlo, places = built.xlo, built.source.bind_world[:, :3, 3]
     public = scipy.sparse.csr_array(xlo.weights.astype(np.float32), dtype=np.float64)
-    joints, weights = _influences(spread_weights(public, xlo.points, places, built.definition).toarray())
+    joints, weights = padded_influences(spread_weights(public, xlo.points, places, built.definition))
     return SkinMeshText(
         name="c_skin_xlo",
         points=xlo.points,
@@ -187,8 +179,8 @@ def _xlo_skin(built: _Built) -> SkinMeshText:
         face_vert_counts=np.full(len(xlo.triangles), 3, np.int32),
         uv=xlo.uv,
         uv_indices=xlo.uv_indices,
-        joint_indices=joints,
-        joint_weights=weights,
+        joint_indices=joints.astype(np.int32),
+        joint_weights=weights.astype(np.float32),
     )
 
 

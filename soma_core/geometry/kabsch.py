@@ -8,6 +8,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from soma_core.geometry.rotations import vee
+
 __all__ = ["PRIOR_STRENGTH", "cofactor", "rotation_from_covariance"]
 
 PRIOR_STRENGTH = 1e-5
@@ -91,9 +93,7 @@ class _NearestRotation(torch.autograd.Function):
         trace = torch.diagonal(stretch, dim1=-2, dim2=-1).sum(-1)
         eye = torch.eye(3, dtype=grad.dtype, device=grad.device)
         system = trace[..., None, None] * eye - stretch
-        local = rotation.transpose(-1, -2) @ grad
-        local = local - local.transpose(-1, -2)
-        torque = torch.stack((local[..., 2, 1], local[..., 0, 2], local[..., 1, 0]), -1)
+        torque = vee(rotation.transpose(-1, -2) @ grad)
         adjugate = cofactor(system)  # symmetric, so the cofactor is the adjugate
         det = (system[..., 0, :] * adjugate[..., 0, :]).sum(-1)
         floor = torch.finfo(grad.dtype).tiny + torch.finfo(grad.dtype).eps * trace.abs() ** 3 * 1e-6

@@ -11,9 +11,10 @@ import numpy as np
 import scipy.sparse
 
 from soma_core.errors import AssetError
+from soma_core.geometry.tree import depth_order
 from soma_core.rig.revision import REVISION_DIGITS, rig_hash
 from soma_core.rig.skeleton import Rig
-from soma_core.rig.transforms import depth_order, project_rotations
+from soma_core.rig.transforms import project_rotations
 from soma_core.rig.twist_weights import fold_weights
 
 __all__ = ["ROW_SUM_TOLERANCE", "StoredRig", "refuse_bad_weights"]

@@ -10,7 +10,9 @@ from fractions import Fraction
 
 import numpy as np
 
-__all__ = ["depth_order", "fused_product", "local_transforms", "project_rotations", "world_transforms"]
+from soma_core.geometry.tree import depth_order
+
+__all__ = ["fused_product", "local_transforms", "project_rotations", "world_transforms"]
 
 _Matrix = list[list[Fraction]]
 
@@ -70,17 +72,6 @@ def fused_product(left: np.ndarray, right: np.ndarray) -> np.ndarray:
                     for sum_before, value in zip(product[row].tolist(), values, strict=True)
                 ]
     return product
-
-
-def depth_order(parents: np.ndarray) -> np.ndarray:
-    """Return the stable order of joints by depth, so that parents come before children."""
-    depth = []
-    for joint in range(len(parents)):
-        steps, ancestor = 0, int(parents[joint])
-        while ancestor >= 0:
-            steps, ancestor = steps + 1, int(parents[ancestor])
-        depth.append(steps)
-    return np.argsort(depth, kind="stable")
 
 
 def world_transforms(local: np.ndarray, parents: np.ndarray) -> np.ndarray:

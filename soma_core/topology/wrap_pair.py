@@ -8,10 +8,10 @@ import numpy as np
 
 from soma_core.errors import AssetError, InputError
 from soma_core.files import refuse_unreadable
+from soma_core.geometry.mesh import triangle_sides
 from soma_core.rig.mesh import CanonicalMesh
 
 __all__ = [
-    "canonical_edges",
     "check_count",
     "check_faces",
     "check_order",
@@ -78,24 +78,9 @@ def _fan(fields: list[str], count: int) -> list[tuple[int, int, int]]:
     return [(ids[0], ids[i], ids[i + 1]) for i in range(1, len(ids) - 1)]
 
 
-def canonical_edges(mesh: CanonicalMesh) -> tuple[np.ndarray, np.ndarray]:
-    """Both ends (e,) of every polygon edge, each edge once."""
-    edges = _canonical_edges(mesh)
-    return edges >> 32, edges & 0xFFFFFFFF
-
-
-def _canonical_edges(mesh: CanonicalMesh) -> np.ndarray:
-    """Polygon edges as sorted, unique 64-bit keys."""
-    starts = np.concatenate([[0], np.cumsum(mesh.face_vert_counts)[:-1]])
-    corner = np.arange(len(mesh.face_vert_indices))
-    face = np.repeat(np.arange(len(starts)), mesh.face_vert_counts)
-    following = starts[face] + (corner - starts[face] + 1) % mesh.face_vert_counts[face]
-    return np.unique(_edge_keys(mesh.face_vert_indices, mesh.face_vert_indices[following]))
-
-
-def _edge_keys(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    low, high = np.minimum(a, b).astype(np.int64), np.maximum(a, b).astype(np.int64)
-    return low << 32 | high
+def _edge_keys(sides: np.ndarray) -> np.ndarray:
+    ids = sides.astype(np.int64)
+    return ids.min(1) << 32 | ids.max(1)
 
 
 def check_wrap(vertices: np.ndarray, triangles: np.ndarray, mesh: CanonicalMesh, *, path: Path) -> None:
@@ -118,9 +103,7 @@ def check_count(vertices: np.ndarray, mesh: CanonicalMesh, *, path: Path) -> Non
 
 def check_faces(triangles: np.ndarray, mesh: CanonicalMesh, *, path: Path) -> None:
     """Refuse faces that are no part of a canonical polygon; its diagonals are free."""
-    canonical = _canonical_edges(mesh)
-    keys = [_edge_keys(triangles[:, i], triangles[:, j]) for i, j in ((0, 1), (1, 2), (2, 0))]
-    on_edges = np.sum([np.isin(key, canonical) for key in keys], axis=0)
+    on_edges = np.isin(_edge_keys(triangle_sides(triangles)), _edge_keys(mesh.edges())).reshape(3, -1).sum(0)
     strange = int((on_edges < 2).sum())
     if strange:
         raise InputError(
@@ -133,7 +116,7 @@ def check_faces(triangles: np.ndarray, mesh: CanonicalMesh, *, path: Path) -> No
 
 def check_order(vertices: np.ndarray, mesh: CanonicalMesh, *, path: Path) -> None:
     """Catch a permutation applied to vertices and not to faces: neighbours would lie far apart."""
-    start, end = canonical_edges(mesh)
+    start, end = mesh.edges().T
 
     def relative(points: np.ndarray) -> float:
         diagonal = float(np.linalg.norm(np.ptp(points, axis=0))) or 1.0

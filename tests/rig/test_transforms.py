@@ -1,8 +1,8 @@
 import numpy as np
 import scipy.spatial.transform
 
+from soma_core.geometry.tree import depth_order
 from soma_core.rig.transforms import (
-    depth_order,
     fused_product,
     local_transforms,
     project_rotations,

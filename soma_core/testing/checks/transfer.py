@@ -13,7 +13,6 @@ from soma_core.geometry.barycentric import closest_point_on_triangle
 from soma_core.plugin.checks import CheckFailedError, check
 from soma_core.testing.context import Context
 from soma_core.topology.closest import ClosestFaces
-from soma_core.topology.wrap_pair import canonical_edges
 
 __all__ = ["CHECKS"]
 
@@ -82,7 +81,7 @@ def _refuse_uncovered(context: Context, native: np.ndarray, body: np.ndarray) ->
 @check("transfer-random", level="core", needs=("stature",))
 def transfer_random(context: Context) -> None:
     """Random bodies keep the neighbourhoods of the default body."""
-    start, end = canonical_edges(context.mesh)
+    start, end = context.mesh.edges().T
     bodies = context.bodies.identity.fitted_rest.numpy()
     length = np.linalg.norm(bodies[:, start] - bodies[:, end], axis=-1)
     length /= np.median(length, axis=1, keepdims=True)
