@@ -36,7 +36,7 @@ TREE_MIB = 24
 
 # A package imports from lower ranks and its own, never from higher ones.
 RANKS = [
-    {"_lazy", "_version", "errors", "paths", "cache", "files", "npz", "progress"},
+    {"_lazy", "_version", "errors", "paths", "cache", "files", "npz", "obj", "progress"},
     {"geometry", "plugin"},
     {"kernels", "_inputs"},
     {"rig", "topology", "skeleton", "animation", "correctives"},
@@ -81,7 +81,8 @@ PUBLIC_NAMES = {
     "soma_core.plugin": """
         API_VERSION Axis BackendSpec BrokenBackendError Check CheckFailedError ClosestFaces FileNeeded
         Generator HasLinearBasis HasPosed HasRandomPoses HasSkinning HasTriangles Level LinearBasis
-        Parameter PluginError Registry SkinnedModel Unit WrapPair atomic_write axis_angle_to_matrix
+        Parameter PluginError Registry SkinnedModel Unit WrapPair atomic_arrays atomic_write
+        axis_angle_to_matrix
         cached_arrays check closest_point_on_triangle content_key data_dir file_sha256 hookimpl
         open_npz_file read_obj read_pickled_arrays refuse_unreadable write_obj
     """,
@@ -261,7 +262,7 @@ def test_torch_kernels_import_no_warp() -> None:
         "import sys; sys.modules['warp'] = None\n"
         "import torch\n"
         "from soma_core import PoseInversion, SomaLayer\n"
-        "layer = SomaLayer('soma', lod='xlo', kernels='torch')\n"
+        "layer = SomaLayer('soma', lod='low', kernels='torch')\n"
         "identity = layer.identity()\n"
         "posed = layer.pose(identity, torch.zeros(1, 77, 3))\n"
         "PoseInversion(layer, kernels='torch')(posed.vertices, identity)"

@@ -12,14 +12,14 @@ import numpy as np
 
 from soma_core.errors import AssetError, InputError, SomaError
 from soma_core.io.npz_fields import NpzFields, open_npz
-from soma_core.io.soma_npz import METRES_PER_UNIT
 from soma_core.io.vertex_sequence import UpAxis, VertexSequence
 from soma_core.npz import ArrayHeader, read_array_header
+from soma_core.topology.frames import METRES, METRES_PER_UNIT
 
 __all__ = ["ArraySequence", "open_npy", "open_npz_vertices"]
 
 _KEY = "vertices"
-_UNITS = METRES_PER_UNIT | {"m": 1.0, "cm": 0.01, "mm": 0.001}
+_UNITS = METRES_PER_UNIT | {str(unit): metres for unit, metres in METRES.items()}
 _AXES: dict[str, UpAxis] = {"Y": "+y", "Z": "+z"}
 _Named = TypeVar("_Named")
 _DAMAGE = (ValueError, EOFError, OSError, RuntimeError, MemoryError, zipfile.BadZipFile, zlib.error)

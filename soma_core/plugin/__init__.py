@@ -11,12 +11,13 @@ from typing import TYPE_CHECKING
 from soma_core._lazy import lazy_names
 
 if TYPE_CHECKING:
-    from soma_core.cache import atomic_write, cached_arrays, content_key, file_sha256
+    from soma_core.cache import atomic_arrays, atomic_write, cached_arrays, content_key, file_sha256
     from soma_core.files import refuse_unreadable
     from soma_core.geometry.barycentric import closest_point_on_triangle
     from soma_core.geometry.rotations import axis_angle_to_matrix
     from soma_core.io.pickled_arrays import read_pickled_arrays
     from soma_core.npz import open_npz_file
+    from soma_core.obj import read_obj, write_obj
     from soma_core.paths import data_dir
     from soma_core.plugin.checks import Check, CheckFailedError, Level, check
     from soma_core.plugin.errors import BrokenBackendError, PluginError
@@ -39,9 +40,7 @@ if TYPE_CHECKING:
         Unit,
         WrapPair,
     )
-    from soma_core.testing.synthetic import write_obj
     from soma_core.topology.closest import ClosestFaces
-    from soma_core.topology.wrap_pair import read_obj
 
 __all__ = [
     "API_VERSION",
@@ -66,6 +65,7 @@ __all__ = [
     "SkinnedModel",
     "Unit",
     "WrapPair",
+    "atomic_arrays",
     "atomic_write",
     "axis_angle_to_matrix",
     "cached_arrays",
@@ -96,13 +96,12 @@ _HOMES = {
     "soma_core.plugin.errors": ["BrokenBackendError", "PluginError"],
     # Files of the user, read without running them, and what is derived from them
     "soma_core.paths": ["data_dir"],
-    "soma_core.cache": ["atomic_write", "cached_arrays", "content_key", "file_sha256"],
+    "soma_core.cache": ["atomic_arrays", "atomic_write", "cached_arrays", "content_key", "file_sha256"],
     "soma_core.files": ["refuse_unreadable"],
     "soma_core.npz": ["open_npz_file"],
     "soma_core.io.pickled_arrays": ["read_pickled_arrays"],
     # Meshes and rotations
-    "soma_core.topology.wrap_pair": ["read_obj"],
-    "soma_core.testing.synthetic": ["write_obj"],
+    "soma_core.obj": ["read_obj", "write_obj"],
     "soma_core.topology.closest": ["ClosestFaces"],
     "soma_core.geometry.barycentric": ["closest_point_on_triangle"],
     "soma_core.geometry.rotations": ["axis_angle_to_matrix"],

@@ -46,7 +46,8 @@ class Smoothness:
     @classmethod
     def of(cls, triangles: np.ndarray, count: int) -> Smoothness:
         """Build it from the triangles of a mesh of `count` vertices."""
-        laplacian = random_walk(unique_edges(triangle_sides(triangles)), count)
+        edges = unique_edges(triangle_sides(triangles)).astype(np.int32)  # and so the matrices' indices
+        laplacian = random_walk(edges, count)
         return cls(triangles=triangles, laplacian=laplacian, energy=(laplacian.T @ laplacian).tocsr())
 
 

@@ -17,8 +17,8 @@ import scipy.sparse
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from soma_core.cache import atomic_write
 from soma_core.io.joint_order import PARENT_NAMES
+from soma_core.obj import write_obj
 from soma_core.plugin.spec import WrapPair
 from soma_core.rig.mesh import CanonicalMesh
 from soma_core.rig.skeleton import Rig
@@ -27,7 +27,6 @@ __all__ = [
     "NATIVE_FROM_CANONICAL",
     "synthetic_canonical",
     "synthetic_native",
-    "write_obj",
     "write_wrap_pair",
 ]
 
@@ -278,14 +277,6 @@ def _wrap() -> np.ndarray:
     wrap = closest_point_on_triangle(ideal, native[triangles[face]])
     wrap[mesh.face_interior] = ideal[mesh.face_interior]
     return wrap
-
-
-def write_obj(path: Path | str, vertices: np.ndarray, triangles: np.ndarray) -> Path:
-    """Write a triangle mesh as an OBJ that reads back bit for bit."""
-    lines = [f"v {x!r} {y!r} {z!r}" for x, y, z in vertices.tolist()]
-    lines += [f"f {a} {b} {c}" for a, b, c in (np.asarray(triangles) + 1).tolist()]
-    atomic_write(Path(path), lambda temporary: temporary.write_text("\n".join(lines) + "\n") and None)
-    return Path(path)
 
 
 def write_wrap_pair(folder: Path | str) -> WrapPair:

@@ -20,11 +20,11 @@ from soma_core.io import open_vertex_sequence, read_amass, read_motion
 from soma_core.io.mesh_vertices import read_mesh_vertices
 from soma_core.io.pickled_arrays import read_pickled_arrays
 from soma_core.io.sam3d import read_sam3d
+from soma_core.obj import read_obj
 from soma_core.rig.manifest import MANIFEST_NAME, read_manifest
 from soma_core.rig.neutral import load_shape_space, read_topology
 from soma_core.rig.procedural_json import read_procedural
 from soma_core.rig.usd import read_usd_rig
-from soma_core.topology.wrap_pair import read_obj
 from tests.standins.pickles import ch, csc, select, write_pickle
 
 __all__ = ["READERS", "Reader"]

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from soma_core.errors import AssetError, InputError
-from soma_core.topology.wrap_pair import check_wrap, read_obj
+from soma_core.obj import read_obj
+from soma_core.topology.wrap_pair import check_wrap
 from tests.bodies import native_body, tiny_canonical, wrap_vertices, write_obj
 
 MESH, _ = tiny_canonical()
