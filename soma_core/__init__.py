@@ -17,9 +17,10 @@ if TYPE_CHECKING:
     from soma_core.errors import AssetError, InputError, SomaError
     from soma_core.inversion.analytical import AnalyticalOptions
     from soma_core.inversion.autograd import AutogradOptions
+    from soma_core.inversion.diagnosis import diagnose_fit
     from soma_core.inversion.fit import PoseInversion
     from soma_core.inversion.identity import IdentityFit, fit_identity
-    from soma_core.inversion.priors import PosePriors
+    from soma_core.inversion.priors import HINGES, PosePriors
     from soma_core.inversion.result import InversionResult
     from soma_core.io.amass import SmplMotion, read_amass, write_amass
     from soma_core.io.clip import SkinnedClip, skinned_clip
@@ -45,6 +46,7 @@ if TYPE_CHECKING:
     from soma_core.skeleton.identity import Identity
 
 __all__ = [
+    "HINGES",
     "USER_JOINTS",
     "AnalyticalOptions",
     "AssetError",
@@ -73,6 +75,7 @@ __all__ = [
     "__version__",
     "assets_dir",
     "default_registry",
+    "diagnose_fit",
     "fit_identity",
     "load_canonical",
     "load_shape_space",
@@ -102,7 +105,8 @@ _HOMES = {
     "soma_core.inversion.fit": ["PoseInversion"],
     "soma_core.inversion.result": ["InversionResult"],
     "soma_core.inversion.identity": ["IdentityFit", "fit_identity"],
-    "soma_core.inversion.priors": ["PosePriors"],
+    "soma_core.inversion.priors": ["HINGES", "PosePriors"],
+    "soma_core.inversion.diagnosis": ["diagnose_fit"],
     "soma_core.inversion.analytical": ["AnalyticalOptions"],
     "soma_core.inversion.autograd": ["AutogradOptions"],
     # To the meshes and poses of other models
