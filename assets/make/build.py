@@ -12,12 +12,14 @@ from typing import Any
 import numpy as np
 import scipy.sparse
 
+from assets.make.local_transforms import local_transforms
 from assets.make.neutral import compress_shape_space, write_neutral
 from assets.make.segments import RiggedMesh, label_segments
 from assets.make.source import SOURCE_SHA256, SourceRig, read_source
 from assets.make.subdivision import LowMesh, recover_low
 from assets.make.symmetry import mirror_vertices
 from assets.make.twist_template import procedural_document
+from assets.make.twist_weights import spread_weights
 from assets.make.usd_text import SkinMeshText, rig_text
 from assets.make.xlo import LowSkin, XloSkin, make_xlo
 from soma_core.cache import atomic_text, file_sha256
@@ -37,8 +39,7 @@ from soma_core.rig.neutral import SEGMENT_NAMES, ShapeSpace, load_shape_space
 from soma_core.rig.procedural import ProceduralDefinition
 from soma_core.rig.procedural_json import parse_procedural
 from soma_core.rig.revision import REVISION_DIGITS, rig_hash
-from soma_core.rig.transforms import local_transforms, world_transforms
-from soma_core.rig.twist_weights import spread_weights
+from soma_core.rig.transforms import world_transforms
 
 __all__ = ["build_rig"]
 
