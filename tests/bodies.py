@@ -11,13 +11,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from soma_core.obj import write_obj
 from soma_core.plugin.hookspecs import hookimpl
 from soma_core.plugin.registry import Registry
 from soma_core.plugin.spec import BackendSpec, LinearBasis, Parameter, WrapPair
 from soma_core.testing.synthetic import NATIVE_FROM_CANONICAL as TO_NATIVE
 from soma_core.testing.synthetic import synthetic_canonical as tiny_canonical
 from soma_core.testing.synthetic import synthetic_native as native_body
-from soma_core.testing.synthetic import write_obj
 from tests.plugin.fakes import FakeEntryPoint
 
 __all__ = [

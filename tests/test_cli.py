@@ -28,7 +28,7 @@ def _write(config, output: Path) -> None:
 
 
 def _refuse(config, output: Path) -> None:
-    raise AssetError("rig.usda", cause="hash differs", fix="Run: soma assets build")
+    raise AssetError("rig.usda", cause="hash differs", fix="Run: soma assets verify")
 
 
 def test_help_lists_every_task(capsys) -> None:
@@ -83,7 +83,7 @@ def test_a_failed_check_is_one_message_without_traceback(tmp_path: Path, monkeyp
     assert main(["animate"]) == EXIT_FAILED
     streams = capsys.readouterr()
     assert streams.out == ""
-    assert streams.err.splitlines()[-1] == "soma: rig.usda: hash differs. Run: soma assets build"
+    assert streams.err.splitlines()[-1] == "soma: rig.usda: hash differs. Run: soma assets verify"
     assert "Traceback" not in streams.err
 
 
@@ -206,7 +206,6 @@ def test_help_and_listing_import_no_plugin_and_nothing_heavy(arguments: list[str
         "trimesh",
         "numpy",
         "hydra",
-        "rich",
         "soma_backend_anny",
         "anny",
     }

@@ -213,6 +213,7 @@ def _messages(*modules: str) -> Iterator[str]:
 BACKEND = (
     *(f"plugin/{name}.py" for name in ("declaration", "hooks", "registry", "configs", "options")),
     "files.py",
+    "obj.py",
     *(f"topology/{name}.py" for name in ("wrap_pair", "correspondence", "transfer")),
     "config/refusals.py",
 )

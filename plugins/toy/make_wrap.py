@@ -15,8 +15,7 @@ import scipy.sparse
 from soma_backend_toy._figure import SEGMENTS, Segment, figure, figure_triangles
 
 from soma_core import load_canonical
-from soma_core.geometry.barycentric import closest_point_on_triangle
-from soma_core.topology.closest import ClosestFaces
+from soma_core.plugin import ClosestFaces, closest_point_on_triangle, write_obj
 
 FOLDER = Path(__file__).parent / "soma_backend_toy"
 TO_NATIVE = 100 * np.array([[1, 0, 0], [0, 0, -1], [0, 1, 0]])  # metres, +Y up, facing +Z, to the toy's frame
@@ -59,21 +58,14 @@ def neighbour_mean(triangles: np.ndarray) -> scipy.sparse.csr_array:
     return scipy.sparse.diags_array(1 / adjacency.sum(1)) @ adjacency
 
 
-def write(name: str, vertices: np.ndarray, triangles: np.ndarray) -> None:
-    """Write an OBJ with a hundredth of a millimetre of precision."""
-    lines = [f"v {x:.3f} {y:.3f} {z:.3f}" for x, y, z in vertices.tolist()]
-    lines += [f"f {a} {b} {c}" for a, b, c in (triangles + 1).tolist()]
-    (FOLDER / name).write_text("\n".join(lines) + "\n", encoding="ascii")
-
-
 def main() -> None:
     """Write both files into the package."""
     mesh, _ = load_canonical("mid")
     ideal = mesh.vertices @ TO_NATIVE.T
     wrap = wrapped(ideal, neighbour_mean(mesh.triangles))
     wrap[mesh.face_interior] = ideal[mesh.face_interior]  # declared in fill_segments, so never looked at
-    write("native.obj", *outside())
-    write("wrap.obj", wrap, mesh.triangles)
+    write_obj(FOLDER / "native.obj", *outside(), digits=3)  # a hundredth of a millimetre
+    write_obj(FOLDER / "wrap.obj", wrap, mesh.triangles, digits=3)
 
 
 if __name__ == "__main__":

@@ -7,17 +7,10 @@ import torch
 from torch import Tensor
 
 from soma_core.geometry.torch_func import transformed
+from soma_core.geometry.tree import descendants, joint_levels
 from soma_core.rig.skeleton import Rig
 
-__all__ = ["Kinematics", "absolute_from_relative", "joint_levels", "relative_from_absolute", "to_homogeneous"]
-
-
-def joint_levels(parents: np.ndarray) -> list[np.ndarray]:
-    """Joint ids by depth below the root, root left out; every parent lies on the level before."""
-    depth = np.zeros(len(parents), int)
-    for joint, parent in enumerate(parents):
-        depth[joint] = 0 if parent < 0 else depth[parent] + 1
-    return [np.flatnonzero(depth == level) for level in range(1, depth.max() + 1)]
+__all__ = ["Kinematics", "absolute_from_relative", "relative_from_absolute", "to_homogeneous"]
 
 
 def relative_from_absolute(absolute: Tensor, orient: Tensor, parent_orient: Tensor) -> Tensor:
@@ -41,15 +34,6 @@ def to_homogeneous(rotations: Tensor, positions: Tensor) -> Tensor:
     bottom = top.new_zeros(*top.shape[:-2], 1, 4)
     bottom[..., 3] = 1
     return torch.cat((top, bottom), -2)
-
-
-def _ancestors(parents: np.ndarray) -> np.ndarray:
-    """(J, J) matrix that sums a quantity from the root down to each joint."""
-    matrix = np.zeros((len(parents), len(parents)))
-    for joint in np.concatenate([[0], *joint_levels(parents)]):
-        matrix[joint] = matrix[parents[joint]] if parents[joint] >= 0 else 0
-        matrix[joint, joint] = 1
-    return matrix
 
 
 class Kinematics(torch.nn.Module):
@@ -94,7 +78,7 @@ class Kinematics(torch.nn.Module):
         bind_turn = bind @ orient.transpose(0, 2, 1)  # accumulated turns of the bind pose
         keep("bind_rotation", bind)
         keep("bind_parent_turn", bind_turn[parents])
-        keep("ancestors", _ancestors(rig.parents))
+        keep("ancestors", descendants(rig.parents).T.astype(float))  # sums from the root down to each joint
         first = 0  # rank, in level order, of the first joint on the level above
         for index, level in enumerate(levels):
             keep(f"level_{index}", level)

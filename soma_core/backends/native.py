@@ -17,6 +17,7 @@ from soma_core.npz import open_npz_file
 from soma_core.paths import assets_dir
 from soma_core.plugin.hookspecs import hookimpl
 from soma_core.plugin.spec import BackendSpec, Generator, LinearBasis, Parameter
+from soma_core.rig.manifest import RESTORE
 
 if TYPE_CHECKING:
     import torch
@@ -33,13 +34,12 @@ def component_count(path: Path) -> int:
     Raises:
         AssetError: the file is missing, damaged, or holds no shape space.
     """
-    fix = "Restore it with `git checkout -- assets`, or make it again with `soma assets build`"
-    with open_npz_file(path, fix=fix) as file:
+    with open_npz_file(path, fix=RESTORE) as file:
         try:
             (count,) = file.header("eigenvalues").shape
         except (KeyError, ValueError) as error:
             cause = f"no shape space can be read ({type(error).__name__}: {error})"
-            raise AssetError(path, cause=cause, fix=fix) from error
+            raise AssetError(path, cause=cause, fix=RESTORE) from error
     return int(count)
 
 

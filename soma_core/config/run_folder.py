@@ -15,7 +15,7 @@ from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
 
-from soma_core.cache import atomic_write
+from soma_core.cache import atomic_text
 from soma_core.paths import assets_dir
 from soma_core.plugin.registry import default_registry
 
@@ -56,13 +56,9 @@ def describe_environment(config: DictConfig, *, command: Sequence[str]) -> dict[
 def write_provenance(folder: Path, config: DictConfig, *, command: Sequence[str]) -> None:
     """Write ``config.yaml`` and ``environment.json`` into `folder`."""
     text = OmegaConf.to_yaml(config, resolve=True)
-    atomic_write(folder / "config.yaml", lambda path: _write_text(path, text))
+    atomic_text(folder / "config.yaml", text)
     document = json.dumps(describe_environment(config, command=command), indent=2) + "\n"
-    atomic_write(folder / "environment.json", lambda path: _write_text(path, document))
-
-
-def _write_text(path: Path, text: str) -> None:
-    path.write_text(text, encoding="utf-8")
+    atomic_text(folder / "environment.json", document)
 
 
 class _OwnRecords(logging.Filter):

@@ -12,9 +12,10 @@ from torch import Tensor
 
 from soma_core.cache import content_key
 from soma_core.correctives.bind_body import BindBody
-from soma_core.correctives.frames import SurfaceFrames, diffused, random_walk
-from soma_core.correctives.masks import find_creases, geodesic_falloff, mesh_edges
+from soma_core.correctives.frames import SurfaceFrames, diffused
+from soma_core.correctives.masks import find_creases, geodesic_falloff
 from soma_core.correctives.sections import Sections
+from soma_core.geometry.laplacian import adjacency, random_walk
 from soma_core.rig.mesh import CanonicalMesh
 from soma_core.rig.skeleton import Rig
 from soma_core.skeleton.identity import Identity
@@ -67,19 +68,17 @@ class ElasticSurface:
         self.body = BindBody(rig, identity)
         points = self.body.identity.rest[0].numpy()
         bind_world = self.body.identity.bind_world[0].numpy()
-        edges = mesh_edges(mesh)
+        edges = mesh.edges()
         laplacian = random_walk(edges, len(points))
         self._frames = SurfaceFrames(
             points, self.body.weights, laplacian, step=_STEP, rounds=_ROUNDS, kernels=kernels
         )
-        ones = np.ones(len(edges))
-        half = scipy.sparse.csr_array((ones, (edges[:, 0], edges[:, 1])), shape=laplacian.shape)
-        adjacency = half + half.T
-        degree = np.asarray(adjacency.sum(1)).ravel()
+        neighbours = adjacency(edges, len(points))
+        degree = np.asarray(neighbours.sum(1)).ravel()
         self._held = _attachment(mesh, rig, laplacian)
-        matrix = scipy.sparse.diags_array(degree + self._held) - adjacency
+        matrix = scipy.sparse.diags_array(degree + self._held) - neighbours
         self._factor = splu(matrix.tocsc())
-        self._adjacency, self._degree = adjacency, degree
+        self._adjacency, self._degree = neighbours, degree
         creases = find_creases(rig)
         falloff = geodesic_falloff(mesh, creases, reach=_REACH)
         self.sections = Sections(points, mesh.triangles, falloff, np.array(creases.joints), bind_world)

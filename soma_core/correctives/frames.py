@@ -13,21 +13,12 @@ from torch import Tensor
 from soma_core.geometry.kabsch import rotation_from_covariance
 from soma_core.geometry.sparse import sparse_product
 
-__all__ = ["SurfaceFrames", "diffused", "random_walk"]
+__all__ = ["SurfaceFrames", "diffused"]
 
 _SMALLEST = 1e-4
 """Smoothed weights below this are dropped."""
 
 _PAIRS = tuple((row, column) for row in range(4) for column in range(row, 4))
-
-
-def random_walk(edges: np.ndarray, count: int) -> scipy.sparse.csr_array:
-    """Laplacian ``I - D^-1 A`` (v, v) of the edges (e, 2) of a mesh: its steps are as long as they are."""
-    ones = np.ones(len(edges))
-    adjacency = scipy.sparse.csr_array((ones, (edges[:, 0], edges[:, 1])), shape=(count, count))
-    adjacency = adjacency + adjacency.T
-    degree = np.asarray(adjacency.sum(1)).ravel()
-    return scipy.sparse.eye_array(count, format="csr") - scipy.sparse.diags_array(1 / degree) @ adjacency
 
 
 def diffused(
@@ -51,7 +42,7 @@ class SurfaceFrames:
     Args:
         rest: (v, 3) [m] float64.
         weights: (v, T) skin weights.
-        laplacian: (v, v), see :func:`random_walk`.
+        laplacian: (v, v), see :func:`soma_core.geometry.laplacian.random_walk`.
         step, rounds: strength of the smoothing.
         kernels: ``torch`` or ``warp``; ``auto`` is Warp, which needs no block matrix in memory.
     """

@@ -8,10 +8,12 @@ import numpy as np
 import scipy.sparse
 from scipy.sparse.csgraph import dijkstra
 
+from soma_core.geometry.mesh import triangle_sides, unique_edges
+from soma_core.geometry.tree import descendants
 from soma_core.rig.mesh import CanonicalMesh
 from soma_core.rig.skeleton import Rig
 
-__all__ = ["Creases", "find_creases", "geodesic_falloff", "joint_mask", "mesh_edges", "vertex_mask"]
+__all__ = ["Creases", "find_creases", "geodesic_falloff", "joint_mask", "vertex_mask"]
 
 _TREE_EDGES = 2
 """A corrective listens to joints at most so many bones away."""
@@ -46,7 +48,7 @@ class Creases:
 
 def find_creases(rig: Rig) -> Creases:
     """Find the crease of every joint from the skin weights; joints without one are left out."""
-    subtree = _descendants(rig.parents)
+    subtree = descendants(rig.parents)
     below = rig.weights @ subtree.T.astype(float)  # share of a vertex that each joint's subtree holds
     vertices, radius = {}, {}
     for joint, name in enumerate(rig.joint_names):
@@ -59,23 +61,6 @@ def find_creases(rig: Rig) -> Creases:
     return Creases(vertices=vertices, radius=radius)
 
 
-def _descendants(parents: np.ndarray) -> np.ndarray:
-    """(J, J) booleans: row j marks joint j and all below it."""
-    below = np.eye(len(parents), dtype=bool)
-    for joint in range(len(parents) - 1, 0, -1):
-        below[parents[joint]] |= below[joint]
-    return below
-
-
-def mesh_edges(mesh: CanonicalMesh) -> np.ndarray:
-    """Edges of the polygons, each once, smaller id first, (e, 2)."""
-    ends = np.cumsum(mesh.face_vert_counts)
-    following = np.arange(1, len(mesh.face_vert_indices) + 1)
-    following[ends - 1] = ends - mesh.face_vert_counts
-    pairs = np.stack([mesh.face_vert_indices, mesh.face_vert_indices[following]], 1).astype(np.int64)
-    return np.unique(np.sort(pairs, 1), axis=0)
-
-
 def geodesic_falloff(mesh: CanonicalMesh, creases: Creases, *, reach: float) -> scipy.sparse.csr_array:
     """How near each vertex is to each joint's crease, along the surface; (J or fewer rows, v) in (0, 1].
 
@@ -84,9 +69,7 @@ def geodesic_falloff(mesh: CanonicalMesh, creases: Creases, *, reach: float) -> 
     so that a hand at the hip, or a finger beside its neighbour, is far.
     """
     count = mesh.vertex_count
-    corners = mesh.triangles.astype(np.int64)
-    edges = np.concatenate([mesh_edges(mesh), *(corners[:, [i, (i + 1) % 3]] for i in range(3))])
-    edges = np.unique(np.sort(edges, 1), axis=0)
+    edges = unique_edges(np.concatenate([mesh.edges(), triangle_sides(mesh.triangles)]))
     length = np.linalg.norm(mesh.vertices[edges[:, 0]] - mesh.vertices[edges[:, 1]], axis=1)
     graph = scipy.sparse.csr_array((length, (edges[:, 0], edges[:, 1])), shape=(count, count))
     rows = []
@@ -113,7 +96,7 @@ def joint_mask(rig: Rig, creases: Creases) -> np.ndarray:
         if parent >= 0:
             bones[joint, parent] = bones[parent, joint] = 1
     near = np.linalg.matrix_power(np.eye(count, dtype=int) + bones, _TREE_EDGES) > 0
-    below = _descendants(rig.parents)
+    below = descendants(rig.parents)
     holds = (rig.weights > 0.01).astype(int)
     touching = (holds.T @ holds).toarray() > 0
     mask = near & (below | below.T | touching)

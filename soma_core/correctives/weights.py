@@ -19,6 +19,7 @@ from soma_core.correctives.features import local_bind_rotations
 from soma_core.errors import AssetError
 from soma_core.files import refuse_unreadable
 from soma_core.rig.skeleton import Rig
+from soma_core.topology.frames import METRES, METRES_PER_UNIT
 
 __all__ = [
     "CorrectiveWeights",
@@ -28,7 +29,7 @@ __all__ = [
     "write_weights",
 ]
 
-_METRES = {"centimeters": 0.01, "cm": 0.01, "meters": 1.0, "m": 1.0, "millimeters": 0.001, "mm": 0.001}
+_METRES = METRES_PER_UNIT | METRES
 _KEYS = ("C_max", "use_tanh", "bindpose", "W1", "W2", "M1_mask", "M2_mask", "meta")
 _MOST_BYTES = 2**30
 _BIND_TOLERANCE = 1e-3

@@ -10,8 +10,9 @@ from omegaconf import DictConfig
 from torch import Tensor
 
 from soma_core.evaluation.report import Figure, Report, ShownBody, Table
+from soma_core.geometry.mesh import enclosed_volume
 from soma_core.layer import SomaLayer
-from soma_core.rig.twist_weights import fold_weights
+from soma_core.rig.stored import fold_weights
 
 __all__ = ["run"]
 
@@ -56,12 +57,6 @@ def section_areas(
                 ends[end, chosen] = point[chosen]
         areas.append(0.5 * abs((np.cross(ends[0] - origin, ends[1] - origin) @ normal).sum()))
     return np.array(areas)
-
-
-def enclosed_volume(vertices: np.ndarray, triangles: np.ndarray) -> float:
-    """Volume [m3] inside a closed mesh."""
-    a, b, c = (vertices[triangles[:, corner]] for corner in range(3))
-    return float((a * np.cross(b, c)).sum() / 6)
 
 
 def _twisted(layer: SomaLayer, turned: str, start: str, end: str) -> tuple[dict[str, np.ndarray], np.ndarray]:

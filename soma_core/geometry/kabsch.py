@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import torch
 from torch import Tensor
 
+from soma_core.geometry.rotations import vee
 from soma_core.geometry.torch_func import transformed
 
 __all__ = ["PRIOR_STRENGTH", "cofactor", "rotation_from_covariance"]
@@ -80,9 +82,7 @@ def _change(covariance: Tensor, rotation: Tensor, moved: Tensor) -> Tensor:
     trace = torch.diagonal(stretch, dim1=-2, dim2=-1).sum(-1)
     eye = torch.eye(3, dtype=moved.dtype, device=moved.device)
     system = trace[..., None, None] * eye - stretch
-    local = rotation.transpose(-1, -2) @ moved
-    local = local - local.transpose(-1, -2)
-    torque = torch.stack((local[..., 2, 1], local[..., 0, 2], local[..., 1, 0]), -1)
+    torque = vee(rotation.transpose(-1, -2) @ moved)
     adjugate = cofactor(system)  # symmetric, so the cofactor is the adjugate
     det = (system[..., 0, :] * adjugate[..., 0, :]).sum(-1)
     floor = torch.finfo(moved.dtype).tiny + torch.finfo(moved.dtype).eps * trace.abs() ** 3 * 1e-6
@@ -101,12 +101,13 @@ class _NearestRotation(torch.autograd.Function):
         return _nearest_rotation(covariance)
 
     @staticmethod
-    def setup_context(ctx, inputs, output) -> None:
+    def setup_context(ctx: Any, inputs: tuple[Tensor], output: Tensor) -> None:
         ctx.save_for_backward(inputs[0], output)
 
     @staticmethod
-    def backward(ctx, grad: Tensor) -> Tensor:
-        return _change(*ctx.saved_tensors, grad)
+    def backward(ctx: Any, grad: Tensor) -> Tensor:
+        covariance, rotation = ctx.saved_tensors
+        return _change(covariance, rotation, grad)
 
 
 class _NearestRotationAnyWay(_NearestRotation):
@@ -115,13 +116,14 @@ class _NearestRotationAnyWay(_NearestRotation):
     generate_vmap_rule = True
 
     @staticmethod
-    def setup_context(ctx, inputs, output) -> None:
+    def setup_context(ctx: Any, inputs: Any, output: Tensor) -> None:
         ctx.save_for_backward(inputs[0], output)
         ctx.save_for_forward(inputs[0], output)
 
     @staticmethod
-    def jvp(ctx, tangent: Tensor) -> Tensor:
-        return _change(*ctx.saved_tensors, tangent)
+    def jvp(ctx: Any, tangent: Tensor) -> Tensor:
+        covariance, rotation = ctx.saved_tensors
+        return _change(covariance, rotation, tangent)
 
 
 def rotation_from_covariance(covariance: Tensor, *, reference: Tensor | None = None) -> Tensor:

@@ -1,11 +1,11 @@
-"""Cotangent Laplacian of a triangle mesh."""
+"""Laplacians of meshes: by cotangents, and by edges alone."""
 
 from __future__ import annotations
 
 import numpy as np
 import scipy.sparse
 
-__all__ = ["cotangent_laplacian", "vertex_areas"]
+__all__ = ["adjacency", "cotangent_laplacian", "random_walk", "vertex_areas"]
 
 _CLAMP = 1e-6
 """Smallest edge weight relative to the mean: keeps the interior block positive definite."""
@@ -44,3 +44,16 @@ def vertex_areas(vertices: np.ndarray, triangles: np.ndarray) -> np.ndarray:
     a, b, c = (vertices[triangles[:, corner]] for corner in range(3))
     area = np.linalg.norm(np.cross(b - a, c - a), axis=1) / 6
     return np.bincount(triangles.ravel(), np.repeat(area, 3), len(vertices))
+
+
+def adjacency(edges: np.ndarray, count: int) -> scipy.sparse.csr_array:
+    """Symmetric matrix (v, v) with a 1 for each of the edges (e, 2), each of which is given once."""
+    half = scipy.sparse.csr_array((np.ones(len(edges)), (edges[:, 0], edges[:, 1])), shape=(count, count))
+    return half + half.T
+
+
+def random_walk(edges: np.ndarray, count: int) -> scipy.sparse.csr_array:
+    """Laplacian ``I - D^-1 A`` (v, v) of the edges (e, 2) of a mesh: its steps are as long as they are."""
+    neighbours = adjacency(edges, count)
+    degree = np.maximum(np.asarray(neighbours.sum(1)).ravel(), 1)
+    return scipy.sparse.eye_array(count, format="csr") - scipy.sparse.diags_array(1 / degree) @ neighbours

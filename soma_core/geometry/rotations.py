@@ -13,6 +13,7 @@ __all__ = [
     "orthonormality_error",
     "shortest_arc",
     "skew",
+    "vee",
 ]
 
 _SERIES_BELOW = {torch.float32: 1e-4, torch.float64: 1e-8}
@@ -25,6 +26,12 @@ def skew(vector: Tensor) -> Tensor:
     zero = torch.zeros_like(x)
     rows = (zero, -z, y, z, zero, -x, -y, x, zero)
     return torch.stack(rows, -1).unflatten(-1, (3, 3))
+
+
+def vee(matrix: Tensor) -> Tensor:
+    """The vector v of the antisymmetric part, ``skew(v) == matrix - matrix^T``; (..., 3, 3) -> (..., 3)."""
+    turn = matrix - matrix.transpose(-1, -2)
+    return torch.stack((turn[..., 2, 1], turn[..., 0, 2], turn[..., 1, 0]), -1)
 
 
 def axis_angle_to_matrix(axis_angle: Tensor) -> Tensor:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import scipy.sparse
 import torch
@@ -28,15 +30,15 @@ class _Gather(torch.autograd.Function):
     """``out = A @ dense`` with constant A; the backward pass applies the transpose, row by row."""
 
     @staticmethod
-    def forward(dense, crow, col, val, _t_crow, _t_col, _t_val):
+    def forward(dense: Tensor, crow: Tensor, col: Tensor, val: Tensor, *_transpose: Tensor) -> Tensor:
         return sparse_product((crow, col, val), dense)
 
     @staticmethod
-    def setup_context(ctx, inputs, _output) -> None:
+    def setup_context(ctx: Any, inputs: tuple[Tensor, ...], _output: Tensor) -> None:
         ctx.save_for_backward(*inputs[4:])
 
     @staticmethod
-    def backward(ctx, grad):
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
         back = sparse_product(ctx.saved_tensors, grad.contiguous())
         return back, None, None, None, None, None, None
 
@@ -45,25 +47,26 @@ class _GatherAnyWay(_Gather):
     """The same for every transform of ``torch.func``, in any order."""
 
     @staticmethod
-    def forward(dense, *matrix):
-        return sparse_product(matrix[:3], dense.contiguous())
+    def forward(dense: Tensor, *matrix: Tensor) -> Tensor:
+        crow, col, val = matrix[:3]
+        return sparse_product((crow, col, val), dense.contiguous())
 
     @staticmethod
-    def setup_context(ctx, inputs, _output) -> None:
+    def setup_context(ctx: Any, inputs: tuple[Tensor, ...], _output: Tensor) -> None:
         ctx.save_for_backward(*inputs[1:])
         ctx.save_for_forward(*inputs[1:])
 
     @staticmethod
-    def backward(ctx, grad):
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
         matrix = ctx.saved_tensors
         return _GatherAnyWay.apply(grad, *matrix[3:], *matrix[:3]), *[None] * 6
 
     @staticmethod
-    def jvp(ctx, tangent, *_constant):
+    def jvp(ctx: Any, tangent: Tensor, *_constant: Tensor) -> Tensor:
         return _GatherAnyWay.apply(tangent, *ctx.saved_tensors)
 
     @staticmethod
-    def vmap(_info, in_dims, dense, *matrix):
+    def vmap(_info: Any, in_dims: Any, dense: Tensor, *matrix: Tensor) -> tuple[Tensor, int]:
         assert not any(dim is not None for dim in in_dims[1:]), "the matrix is constant"
         dense = dense.movedim(in_dims[0], 2)
         out = _GatherAnyWay.apply(dense.flatten(1), *matrix)
@@ -85,6 +88,13 @@ class SparseRows(torch.nn.Module):
     ``operator(dense)`` computes the (m, f) product with a contiguous dense (n, f) matrix. Sums run in
     index order on every device, so results are deterministic.
     """
+
+    crow: Tensor
+    col: Tensor
+    val: Tensor
+    t_crow: Tensor
+    t_col: Tensor
+    t_val: Tensor
 
     def __init__(
         self, matrix: scipy.sparse.sparray, *, dtype: torch.dtype, device: torch.device | str

@@ -28,8 +28,8 @@ _LOWER, _RAISE, _LEAST_RAISED, _MOST_DAMPING = 0.1, 10.0, 1e-4, 1e4
 bad one, largest."""
 
 _EARLY, _EVERY = (0, 1, 3, 5), (5, 3)
-"""Steps at which the matrix is made anew: the first ones, and those that leave the second of these numbers when
-divided by the first. In between, the memory makes up for what changes."""
+"""Steps at which the matrix is made anew: the first ones, and those that leave the second of these numbers
+when divided by the first. In between, the memory makes up for what changes."""
 
 _CROWDED = 0.75
 """Share of frames that still move from which those that rest are carried along."""

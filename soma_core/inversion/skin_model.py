@@ -285,7 +285,8 @@ class SkinModel(torch.nn.Module):
         if activity is not None:
             value, scale = activity.value, self.scale(problem).expand(len(transforms))
         return (
-            problem.identity.rest, problem.weights, transforms, value, scale, problem.vertices, problem.origin,
+            problem.identity.rest, problem.weights, transforms, value, scale, problem.vertices,
+            problem.origin,
         )  # fmt: skip
 
     def inverse(

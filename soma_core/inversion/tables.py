@@ -367,7 +367,8 @@ class _Modes:
             ),
             "gram": _joined(
                 (0.5 if p == q else 1.0) * self.gram[p, : size[p], q, : size[q]]
-                for p in blocks for q in self.near[p]
+                for p in blocks
+                for q in self.near[p]
             ),
             "left": left[used].ravel(),
             "right": right[used][..., : offsets.columns].ravel(),

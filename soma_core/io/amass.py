@@ -9,7 +9,7 @@ from typing import Literal, cast, get_args
 
 import numpy as np
 
-from soma_core.cache import atomic_write
+from soma_core.cache import atomic_arrays
 from soma_core.errors import InputError
 from soma_core.io.npz_fields import NpzFields, open_npz
 
@@ -238,10 +238,4 @@ def write_amass(
                 "extra", got=got, expected="plain arrays under other names", fix="Rename or leave it out."
             )
     arrays = {name: np.asarray(value) for name, value in (values | dict(extra or {})).items()}
-    # np.savez appends .npz to other names, and the rename would then miss the file: hand it a stream.
-    atomic_write(Path(path), lambda temporary: _save(temporary, arrays))
-
-
-def _save(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
-    with open(path, "wb") as stream:
-        np.savez_compressed(stream, **arrays)
+    atomic_arrays(Path(path), arrays)

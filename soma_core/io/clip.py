@@ -11,13 +11,14 @@ from scipy.spatial.transform import Rotation
 
 from soma_core.errors import InputError
 from soma_core.rig.expansion import expanded_rig, helper_bind
+from soma_core.rig.influences import padded_influences
 from soma_core.rig.mesh import CanonicalMesh
 from soma_core.rig.skeleton import Rig
 
 if TYPE_CHECKING:
     from soma_core.skeleton.identity import Identity
 
-__all__ = ["BODY_COLOUR", "SkinnedClip", "linear_colour", "skinned_clip", "vertex_normals"]
+__all__ = ["BODY_COLOUR", "SkinnedClip", "linear_colour", "skinned_clip"]
 
 BODY_COLOUR = (0.80, 0.66, 0.58)
 """sRGB colour of a body that has no other."""
@@ -67,15 +68,7 @@ class SkinnedClip:
 
     def influences(self) -> tuple[np.ndarray, np.ndarray]:
         """Joint ids (v, k) int and weights (v, k) float32 of every influence, heaviest first, zero padded."""
-        weights = self.rig.weights.tocsr()
-        counts = np.diff(weights.indptr)
-        rows = np.repeat(np.arange(len(counts)), counts)
-        order = np.lexsort((-weights.data, rows))
-        slots = np.arange(len(rows)) - np.repeat(weights.indptr[:-1], counts)
-        joint_ids = np.zeros((len(counts), int(counts.max())), np.int64)
-        values = np.zeros(joint_ids.shape)
-        joint_ids[rows, slots] = weights.indices[order]
-        values[rows, slots] = weights.data[order]
+        joint_ids, values = padded_influences(self.rig.weights.tocsr())
         return joint_ids, (values / values.sum(axis=1, keepdims=True)).astype(np.float32)
 
 
@@ -188,17 +181,6 @@ def _continuous(rotations: np.ndarray) -> np.ndarray:
     flips = (quaternions[1:] * quaternions[:-1]).sum(-1) < 0
     signs = np.concatenate([np.ones_like(flips[:1], float), np.where(flips, -1.0, 1.0)])[: len(quaternions)]
     return quaternions * np.cumprod(signs, axis=0)[..., None]
-
-
-def vertex_normals(vertices: np.ndarray, triangles: np.ndarray) -> np.ndarray:
-    """Area-weighted unit vertex normals, (v, 3); +Y where a vertex has no area."""
-    corners = vertices[triangles]
-    faces = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    ids = triangles.reshape(-1)
-    weights = np.repeat(faces, 3, axis=0)
-    normals = np.stack([np.bincount(ids, weights[:, axis], len(vertices)) for axis in range(3)], axis=1)
-    length = np.linalg.norm(normals, axis=1, keepdims=True)
-    return np.where(length > 0, normals / np.where(length > 0, length, 1), (0.0, 1.0, 0.0))
 
 
 def linear_colour(colour: tuple[float, float, float]) -> tuple[float, float, float]:

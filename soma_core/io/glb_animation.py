@@ -117,8 +117,8 @@ def _top_down(nodes: list[dict[str, Any]]) -> tuple[list[int], list[int]]:
         for child in node.get("children", ()):
             parents[child] = index
     order = [node for node, parent in enumerate(parents) if parent < 0]
-    for node in order:  # grows while it is walked
-        order.extend(nodes[node].get("children", ()))
+    for parent in order:  # grows while it is walked
+        order.extend(nodes[parent].get("children", ()))
         if len(order) > len(nodes):
             raise ValueError("a node has two parents")
     if len(order) < len(nodes):

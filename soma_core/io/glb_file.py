@@ -30,12 +30,12 @@ class GlbFile:
 
     def __init__(self, path: Path) -> None:
         self._data = np.memmap(path, np.uint8, mode="r")
-        magic, version, length = struct.unpack_from("<4sII", self._data)
+        magic, version, length = struct.unpack_from("<4sII", self._data.data)
         if magic != b"glTF" or version != 2:
             raise ValueError(f"it starts with {magic!r} and version {version}, not a GLB of version 2")
         if length > len(self._data):
             raise ValueError(f"{length - len(self._data)} bytes are missing at the end")
-        size, kind = struct.unpack_from("<I4s", self._data, 12)
+        size, kind = struct.unpack_from("<I4s", self._data.data, 12)
         if kind != b"JSON":
             raise ValueError(f"its first chunk is {kind!r}, not JSON")
         self.document: dict[str, Any] = json.loads(self._data[20 : 20 + size].tobytes())

@@ -10,7 +10,8 @@ from scipy.spatial.transform import Rotation
 
 from soma_core.cache import atomic_write
 from soma_core.errors import InputError
-from soma_core.io.clip import SkinnedClip, linear_colour, vertex_normals
+from soma_core.geometry.mesh import following_corners, vertex_normals
+from soma_core.io.clip import SkinnedClip, linear_colour
 from soma_core.io.glb import GlbBuffer, glb_bytes
 from soma_core.rig.mesh import CanonicalMesh
 
@@ -157,19 +158,18 @@ def _triangle_corners(mesh: CanonicalMesh) -> np.ndarray:
     directed edge belongs to one polygon, so the order of the triangles does not matter.
     """
     stream, counts = mesh.face_vert_indices.astype(np.int64), mesh.face_vert_counts
-    starts = np.concatenate([[0], np.cumsum(counts)[:-1]])
     face = np.repeat(np.arange(len(counts)), counts)
-    following = np.arange(len(stream)) + 1
-    following[starts + counts - 1] = starts
     size = mesh.vertex_count
-    edge_face = dict(zip((stream * size + stream[following]).tolist(), face.tolist(), strict=True))
+    edge_face = dict(
+        zip((stream * size + stream[following_corners(counts)]).tolist(), face.tolist(), strict=True)
+    )
     corner_of = dict(zip((face * size + stream).tolist(), range(len(stream)), strict=True))
     corners = np.empty(mesh.triangles.shape, np.int64)
     for row, (a, b, c) in enumerate(mesh.triangles.tolist()):
         owners = [edge_face.get(edge) for edge in (a * size + b, b * size + c, c * size + a)]
         owner = next((found for found in owners if found is not None), None)
-        places = [corner_of.get(owner * size + v) if owner is not None else None for v in (a, b, c)]
-        if None in places:
+        places = [-1 if owner is None else corner_of.get(owner * size + v, -1) for v in (a, b, c)]
+        if min(places) < 0:
             raise InputError(
                 "mesh.triangles",
                 got=f"triangle {row} ({a}, {b}, {c})",

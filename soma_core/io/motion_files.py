@@ -11,7 +11,7 @@ from typing import Literal
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from soma_core.cache import atomic_write
+from soma_core.cache import atomic_arrays
 from soma_core.errors import InputError
 from soma_core.io.joint_order import USER_JOINTS
 from soma_core.io.kimodo_npz import read_kimodo_npz
@@ -86,8 +86,7 @@ def write_motion(
     arrays = _arrays(motion, rotation_repr)
     if joint_orient is not None and motion.convention == "t_pose_relative":
         arrays["joint_orient"] = np.asarray(joint_orient, np.float32)
-    # np.savez appends .npz to other names, and the rename would then miss the file: hand it a stream.
-    atomic_write(Path(path), lambda temporary: _save(temporary, arrays))
+    atomic_arrays(Path(path), arrays)
 
 
 def write_motion_parts(
@@ -134,11 +133,6 @@ def _check_joints(motion: Motion) -> None:
             expected="the 77 user joints, Hips first",
             fix="Order the joints like soma_core.io.USER_JOINTS.",
         )
-
-
-def _save(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
-    with open(path, "wb") as stream:
-        np.savez_compressed(stream, **arrays)
 
 
 def _arrays(motion: Motion, rotation_repr: str) -> dict[str, np.ndarray]:

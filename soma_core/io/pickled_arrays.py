@@ -65,7 +65,7 @@ def _array(value: Any, depth: int) -> np.ndarray:
         raise ValueError(f"a {type(value).__name__}")
     kind = _class(value)
     if kind.name == "_reconstruct":
-        return _numpy_array(*value.state[-4:])
+        return _numpy_array(*value.state[-4:])  # type: ignore[index]  # refused where there is none
     if kind.name == "_frombuffer":
         data, dtype, shape, order = value.arguments
         return _numpy_array(shape, dtype, order == "F", data)
@@ -116,7 +116,7 @@ def _dtype(value: Any) -> np.dtype:
     if type(name) is not str or not _PLAIN_DTYPE.fullmatch(name):
         raise ValueError("objects or text, not numbers")
     order = value.state[1] if value.state else "="
-    return np.dtype(name).newbyteorder(order if order in ("<", ">", "|", "=") else "=")
+    return np.dtype(name).newbyteorder(order if order in ("<", ">", "|") else "=")  # type: ignore[arg-type]
 
 
 def _buffer(data: Any) -> bytes | memoryview:

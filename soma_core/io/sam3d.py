@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
@@ -191,7 +191,7 @@ def _single(values: np.ndarray) -> np.ndarray:
         return values.astype(np.float32)
 
 
-def _without_vertices(path: Path, names: object) -> InputError:
+def _without_vertices(path: Path, names: Iterable[str]) -> InputError:
     return InputError(
         f"{path}: {_VERTICES}",
         got=f"only the keys {', '.join(names)}",

@@ -11,13 +11,13 @@ from scipy.spatial.transform import Rotation
 from soma_core.io.joint_order import USER_JOINTS
 from soma_core.io.motion import Convention, Motion
 from soma_core.io.npz_fields import NpzFields, check_rotations
+from soma_core.topology.frames import METRES_PER_UNIT
 
 __all__ = ["METRES_PER_UNIT", "SCHEMA_VERSION", "read_soma_npz"]
 
 SCHEMA_VERSION = 1
 """Version of the motion schema that this package writes."""
 
-METRES_PER_UNIT = {"meters": 1.0, "centimeters": 0.01, "millimeters": 0.001}
 
 _ROOT_TOLERANCE = 1e-4
 """Largest entry of |R_Root - I| accepted: Root is virtual, only rounding may move it."""

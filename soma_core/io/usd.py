@@ -9,7 +9,8 @@ import numpy as np
 
 from soma_core.cache import atomic_write
 from soma_core.errors import InputError
-from soma_core.io.clip import SkinnedClip, linear_colour, vertex_normals
+from soma_core.geometry.mesh import vertex_normals
+from soma_core.io.clip import SkinnedClip, linear_colour
 
 __all__ = ["write_usd"]
 

@@ -4,22 +4,24 @@ from __future__ import annotations
 
 import zipfile
 import zlib
+from collections.abc import Mapping
 from pathlib import Path
-from typing import IO
+from typing import IO, TypeVar
 
 import numpy as np
 
 from soma_core.errors import AssetError, InputError, SomaError
 from soma_core.io.npz_fields import NpzFields, open_npz
-from soma_core.io.soma_npz import METRES_PER_UNIT
 from soma_core.io.vertex_sequence import UpAxis, VertexSequence
 from soma_core.npz import ArrayHeader, read_array_header
+from soma_core.topology.frames import METRES, METRES_PER_UNIT
 
 __all__ = ["ArraySequence", "open_npy", "open_npz_vertices"]
 
 _KEY = "vertices"
-_UNITS = METRES_PER_UNIT | {"m": 1.0, "cm": 0.01, "mm": 0.001}
+_UNITS = METRES_PER_UNIT | {str(unit): metres for unit, metres in METRES.items()}
 _AXES: dict[str, UpAxis] = {"Y": "+y", "Z": "+z"}
+_Named = TypeVar("_Named")
 _DAMAGE = (ValueError, EOFError, OSError, RuntimeError, MemoryError, zipfile.BadZipFile, zlib.error)
 _ARCHIVE_DAMAGE = (EOFError, OSError, RuntimeError, zipfile.BadZipFile, zlib.error)
 _MOST_VERTICES = 4_000_000
@@ -114,7 +116,7 @@ def open_npz_vertices(path: Path) -> ArraySequence:
         archive.close()
 
 
-def _named(fields: NpzFields, key: str, known: dict) -> float | UpAxis:
+def _named(fields: NpzFields, key: str, known: Mapping[str, _Named]) -> _Named:
     value = fields.text(key)
     found = known.get(value) or known.get(value.upper())
     if found is None:

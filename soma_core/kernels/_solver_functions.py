@@ -87,7 +87,8 @@ def solver_functions(scalar: str, lanes: int, *, shared: bool) -> SimpleNamespac
         "modes": (matrix.MODES, modes), "factor": (matrix.FACTOR, factor), "solve": (text.SOLVE, solve),
         "terms": (text.TERMS, terms), "move": (text.MOVE, move), "accept": (text.ACCEPT, accept),
         "transform": (view.TRANSFORM, transform), "activate": (view.ACTIVATE, activate),
-        "keep": (view.KEEP, keep), "doubt": (view.DOUBT, doubt), "pull": (view.PULL, pull), "turn": (view.TURN, turn),
+        "keep": (view.KEEP, keep), "doubt": (view.DOUBT, doubt), "pull": (view.PULL, pull),
+        "turn": (view.TURN, turn),
         "still": (text.STILL, root_turn), "selected": (variance.SELECTED, selected),
     }  # fmt: skip
     return SimpleNamespace(**{name: made(*given) for name, given in bodies.items()})

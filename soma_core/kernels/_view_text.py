@@ -59,7 +59,8 @@ ACTIVATE = (
     }
     for (int c = 0; c < activation_count; c++) {
         V sum = zero;
-        for (int e = weigh_start[c]; e < weigh_start[c+1]; e++) sum += weigh_value[e] * feature[weigh_feature[e]];
+        for (int e = weigh_start[c]; e < weigh_start[c+1]; e++)
+            sum += weigh_value[e] * feature[weigh_feature[e]];
         before[c] = active[c] = sum; activity[c] = one;
         if (!squash) continue;
         V value = sum > zero ? sum : zero, rising = sum > zero ? one : zero;
@@ -87,7 +88,8 @@ TURN = """
     for (int i = 0; i < W * feature_count; i++) feature[i] = zero;
     for (int c = 0; c < activation_count; c++) {
         V g = pull[c] * activity[c];
-        for (int e = weigh_start[c]; e < weigh_start[c+1]; e++) feature[weigh_feature[e]] += weigh_value[e] * g;
+        for (int e = weigh_start[c]; e < weigh_start[c+1]; e++)
+            feature[weigh_feature[e]] += weigh_value[e] * g;
     }
     for (int i = 0; i < feature_count; i++) {
         int n = feature_column[i]; if (n < 0) continue;

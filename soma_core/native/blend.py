@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Protocol
 
 import torch
 from torch import Tensor
@@ -12,8 +12,9 @@ from torch import Tensor
 from soma_core.geometry.rotations import axis_angle_to_matrix
 
 if TYPE_CHECKING:
+    from soma_core.inversion.gauss_newton import GaussNewton
     from soma_core.inversion.problem import Pose, Problem, View
-    from soma_core.native.model import NativeRig
+    from soma_core.skeleton.identity import Identity
 
 __all__ = ["BlendedCurvature", "blend_shapes", "blended_view", "is_linear"]
 
@@ -25,6 +26,16 @@ _ROUNDING = 64
 
 _STEP = 1e-4
 """Largest turn [rad] and shift [m] of a central difference along one direction, in float64."""
+
+
+class PosedModel(Protocol):
+    """A skin model that can also pose bodies under all that the native model does."""
+
+    solver: GaussNewton
+
+    def posed(self, identity: Identity, rotations: Tensor, pelvis: Tensor) -> Tensor:
+        """Vertices (F, n, 3) [m] under local rotations (F, J, 3, 3); differentiable."""
+        ...
 
 
 def blend_shapes(
@@ -53,7 +64,7 @@ def is_linear(offsets: Callable[[Tensor], Tensor], shapes: Tensor) -> bool:
     return bool((found - told).abs().max() <= close)
 
 
-def blended_view(rig: NativeRig, problem: Problem, pose: Pose) -> View:
+def blended_view(rig: PosedModel, problem: Problem, pose: Pose) -> View:
     """Error of poses whose blend shapes are not linear, and its derivative by autograd."""
     from soma_core.inversion.skin_model import SkinModel
 
@@ -81,7 +92,7 @@ class BlendedCurvature:
         slope: half its derivative (F, n + 1, 3).
     """
 
-    def __init__(self, rig: NativeRig, problem: Problem, pose: Pose) -> None:
+    def __init__(self, rig: PosedModel, problem: Problem, pose: Pose) -> None:
         self._rig, self._problem = rig, problem
         kind = problem.origin.dtype
         self._pose = replace(pose, relative=pose.relative.to(kind), translation=pose.translation.to(kind))
@@ -122,11 +133,11 @@ class BlendedCurvature:
         return (ahead - behind) * (length / (2 * self._step))
 
 
-def _posed(rig: NativeRig, problem: Problem, pose: Pose) -> Tensor:
+def _posed(rig: PosedModel, problem: Problem, pose: Pose) -> Tensor:
     """Vertices (F, n, 3) about the problem's origin."""
     return rig.posed(problem.identity, pose.relative[:, 1:], pose.translation)
 
 
-def _energy(rig: NativeRig, problem: Problem, pose: Pose) -> Tensor:
+def _energy(rig: PosedModel, problem: Problem, pose: Pose) -> Tensor:
     step = _posed(rig, problem, pose) - (problem.vertices - problem.origin[:, None])
     return (problem.weights * step.square().sum(-1)).double().sum(1)

@@ -122,5 +122,5 @@ def checks_problem(checks: Iterable[object]) -> str | None:
     """Say which of the checks that a plugin gives is none, or return None."""
     for check in checks:
         if not (isinstance(getattr(check, "id", None), str) and callable(getattr(check, "run", None))):
-            return f"soma_checks gave {check!r:.80}, expected a soma_core.testing.Check"
+            return f"soma_checks gave {check!r:.80}, expected a soma_core.plugin.Check"
     return None

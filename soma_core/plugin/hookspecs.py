@@ -8,12 +8,11 @@ from typing import TYPE_CHECKING, Any
 
 import pluggy
 
+from soma_core.plugin.checks import Check
 from soma_core.plugin.spec import BackendSpec, Generator
 
 if TYPE_CHECKING:
     import torch
-
-    from soma_core.testing import Check
 
 __all__ = [
     "ENTRY_POINT_GROUP",

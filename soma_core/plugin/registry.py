@@ -12,9 +12,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from soma_core import __version__
+from soma_core._version import __version__
 from soma_core.errors import InputError
 from soma_core.plugin.causes import cause_and_fix, remedy, supply
+from soma_core.plugin.checks import Check
 from soma_core.plugin.configs import PluginConfigs, find_configs
 from soma_core.plugin.declaration import checks_problem, did_you_mean, spec_problem
 from soma_core.plugin.discovery import CORE_DISTRIBUTION, EntryPointLike, Offer, find_offers
@@ -38,7 +39,6 @@ if TYPE_CHECKING:
     import pluggy
     import torch
 
-    from soma_core.testing import Check
 
 __all__ = ["Entry", "Registry", "State", "WrapMaker", "default_registry"]
 

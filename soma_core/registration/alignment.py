@@ -62,7 +62,8 @@ def find_starts(
     tried = [(*each, *body) for each in zip(surfaces, frames, strict=True) for body in bodies]
     costs = [_start(*each, model, _ROUGHLY).cost for each in tried]
     best = [tried[index] for index in np.argsort(costs, kind="stable")[: max(_LEFT, count)]]
-    return sorted((_start(*each, model, _SAMPLES) for each in best), key=lambda start: start.cost)[:count]
+    starts = [_start(surface, frame, pose, body, model, _SAMPLES) for surface, frame, pose, body in best]
+    return sorted(starts, key=lambda start: start.cost)[:count]
 
 
 def _mean_body(model: BodyModel, pose: BodyPose) -> Surface:

@@ -10,6 +10,7 @@ import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
 
+from soma_core.geometry.tree import descendants
 from soma_core.layer import SomaLayer
 
 __all__ = ["BodyModel", "BodyPose"]
@@ -55,9 +56,7 @@ class BodyModel:
         self.skin = np.setdiff1d(np.arange(layer.mesh.vertex_count), layer.mesh.face_interior)
         parents = layer.rig.parents[1:] - 1
         self.parents = parents
-        below = np.eye(len(parents), dtype=bool)
-        for joint in range(len(parents) - 1, 0, -1):
-            below[parents[joint]] |= below[joint]
+        below = descendants(parents)
         weights = layer.rig.weights.toarray()[:, 1:]
         self.moved = weights @ below.T  # (v, J - 1): share of a vertex that a joint and those below it carry
         self.joints = np.flatnonzero(weights.sum(0) > 0)

@@ -14,7 +14,8 @@ import numpy as np
 import scipy.sparse
 from scipy.sparse.linalg import splu
 
-from soma_core.io.clip import vertex_normals
+from soma_core.geometry.laplacian import random_walk
+from soma_core.geometry.mesh import triangle_sides, unique_edges, vertex_normals
 from soma_core.registration.surface import Surface
 
 __all__ = ["Smoothness", "deform", "project"]
@@ -45,11 +46,8 @@ class Smoothness:
     @classmethod
     def of(cls, triangles: np.ndarray, count: int) -> Smoothness:
         """Build it from the triangles of a mesh of `count` vertices."""
-        ends = np.concatenate([triangles[:, [i, (i + 1) % 3]] for i in range(3)])
-        graph = scipy.sparse.csr_array((np.ones(len(ends)), tuple(ends.T)), shape=(count, count))
-        graph = ((graph + graph.T) > 0).astype(float)
-        degree = np.maximum(np.asarray(graph.sum(1)).ravel(), 1)
-        laplacian = (scipy.sparse.eye_array(count) - scipy.sparse.diags_array(1 / degree) @ graph).tocsr()
+        edges = unique_edges(triangle_sides(triangles)).astype(np.int32)  # and so the matrices' indices
+        laplacian = random_walk(edges, count)
         return cls(triangles=triangles, laplacian=laplacian, energy=(laplacian.T @ laplacian).tocsr())
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from soma_core.io.clip import vertex_normals
+from soma_core.geometry.mesh import vertex_normals
 from soma_core.registration.deform import Smoothness, deform, project
 from soma_core.registration.surface import Surface
 

@@ -12,7 +12,7 @@ import torch
 from scipy.sparse.linalg import splu
 
 from soma_core.errors import InputError
-from soma_core.io.clip import vertex_normals
+from soma_core.geometry.mesh import vertex_normals
 from soma_core.layer import SomaLayer
 from soma_core.plugin.spec import Axis, Unit
 from soma_core.progress import progress

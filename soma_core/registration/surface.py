@@ -8,7 +8,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from soma_core.geometry.barycentric import closest_point_on_triangle
-from soma_core.io.clip import vertex_normals
+from soma_core.geometry.mesh import vertex_normals
 from soma_core.topology.closest import ClosestFaces
 
 __all__ = ["Contact", "Surface"]

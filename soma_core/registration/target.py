@@ -10,6 +10,7 @@ import scipy.sparse
 from scipy.sparse.csgraph import connected_components
 
 from soma_core.errors import InputError
+from soma_core.geometry.mesh import enclosed_volume
 from soma_core.plugin.spec import Axis, Unit
 from soma_core.registration.surface import Surface
 from soma_core.topology.frames import METRES, native_to_canonical
@@ -108,7 +109,7 @@ def find_skin(vertices: np.ndarray, triangles: np.ndarray, *, masked: Sequence[i
     place = np.full(len(vertices), -1)
     place[used] = np.arange(len(used))
     points, part = vertices[used].astype(np.float64), place[part]
-    if _volume(points, part) < 0:
+    if enclosed_volume(points - points.mean(0), part) < 0:
         part = part[:, ::-1].copy()
         notes.append("faces point inwards; turned")
     rim = None
@@ -205,11 +206,6 @@ def _check_surface(triangles: np.ndarray, *, allow_open: bool) -> None:
             f"a nearly closed body, at most {_OPEN:.0%}",
             "Close the holes of the scan, or merge coincident vertices.",
         )
-
-
-def _volume(vertices: np.ndarray, triangles: np.ndarray) -> float:
-    corners = vertices[triangles] - vertices.mean(0)
-    return float(np.einsum("tc,tc->", corners[:, 0], np.cross(corners[:, 1], corners[:, 2]))) / 6
 
 
 def find_unit(extent: float) -> Unit:

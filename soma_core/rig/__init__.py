@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-import importlib
 from typing import TYPE_CHECKING
+
+from soma_core._lazy import lazy_names
 
 if TYPE_CHECKING:
     from soma_core.rig.canonical import load_canonical
@@ -13,15 +14,9 @@ if TYPE_CHECKING:
 __all__ = ["CanonicalMesh", "Lod", "Rig", "load_canonical"]
 
 _HOMES = {
-    "CanonicalMesh": "soma_core.rig.mesh",
-    "Lod": "soma_core.rig.mesh",
-    "Rig": "soma_core.rig.skeleton",
-    "load_canonical": "soma_core.rig.canonical",
+    "soma_core.rig.canonical": ["load_canonical"],
+    "soma_core.rig.mesh": ["CanonicalMesh", "Lod"],
+    "soma_core.rig.skeleton": ["Rig"],
 }
 
-
-def __getattr__(name: str) -> object:
-    """Load a public name on first use, so that importing a part stays cheap."""
-    if name not in _HOMES:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(importlib.import_module(_HOMES[name]), name)
+__getattr__, __dir__ = lazy_names(__name__, _HOMES)

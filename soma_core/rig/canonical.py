@@ -12,10 +12,12 @@ from scipy.spatial import cKDTree
 
 from soma_core.cache import cached_arrays, content_key
 from soma_core.errors import AssetError, InputError
+from soma_core.geometry.mesh import split_polygons
 from soma_core.paths import assets_dir
 from soma_core.rig.manifest import (
     NEUTRAL_NAME,
     PROCEDURAL_NAME,
+    RESTORE,
     RIG_NAME,
     Manifest,
     read_manifest,
@@ -27,7 +29,6 @@ from soma_core.rig.procedural import ProceduralDefinition, ProceduralRig
 from soma_core.rig.procedural_json import read_procedural
 from soma_core.rig.revision import lod_revision
 from soma_core.rig.skeleton import Rig
-from soma_core.rig.subdivision import split_polygons
 
 __all__ = ["load_canonical"]
 
@@ -87,7 +88,7 @@ def _parse(
     found = read_usd_rig(root / RIG_NAME, lod=lod, triangles=topology["triangles"], definition=definition)
     if lod == "mid" and found.rig_hash != manifest.rig_hash:
         cause = f"rig revision is {found.rig.revision}, the manifest says {manifest.rig_revision}"
-        raise AssetError(root / RIG_NAME, cause=cause, fix="Make the assets again with `soma assets build`")
+        raise AssetError(root / RIG_NAME, cause=cause, fix=RESTORE)
     rig, procedural = found.rig, found.rig.procedural
     assert procedural is not None
     if lod == "xlo":

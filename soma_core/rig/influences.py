@@ -1,4 +1,4 @@
-"""Skin weights of a USD mesh: checked, and brought to the order of its skeleton's joints."""
+"""Skin weights of a mesh as USD and glTF hold them: so many influences for every vertex."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from soma_core.rig.stored import refuse_bad_weights
 if TYPE_CHECKING:
     from pxr import Usd
 
-__all__ = ["read_weights"]
+__all__ = ["padded_influences", "read_weights"]
 
 
 def _joint_map(path: Path, skin: Usd.Prim, joint_paths: Sequence[str]) -> np.ndarray:
@@ -76,3 +76,15 @@ def read_weights(
     weights = scipy.sparse.csr_array(scipy.sparse.coo_array(entries, shape=(vertex_count, len(joint_paths))))
     refuse_bad_weights(path, weights)
     return weights
+
+
+def padded_influences(weights: scipy.sparse.csr_array) -> tuple[np.ndarray, np.ndarray]:
+    """Joints (v, k) int64 and weights (v, k) float64 of every influence, heaviest first, zero padded."""
+    counts = np.diff(weights.indptr)
+    rows = np.repeat(np.arange(len(counts)), counts)
+    order = np.lexsort((-weights.data, rows))
+    slots = np.arange(len(rows)) - np.repeat(weights.indptr[:-1], counts)
+    joints = np.zeros((len(counts), int(counts.max())), np.int64)
+    values = np.zeros(joints.shape)
+    joints[rows, slots], values[rows, slots] = weights.indices[order], weights.data[order]
+    return joints, values

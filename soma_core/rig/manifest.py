@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from soma_core.cache import atomic_write, file_sha256
+from soma_core.cache import atomic_text, file_sha256
 from soma_core.errors import AssetError
 from soma_core.files import refuse_unreadable
 
@@ -17,6 +17,7 @@ __all__ = [
     "MANIFEST_NAME",
     "NEUTRAL_NAME",
     "PROCEDURAL_NAME",
+    "RESTORE",
     "RIG_NAME",
     "Manifest",
     "check_files",
@@ -32,7 +33,7 @@ CORRECTIVES_NAME = "correctives_model.pt"
 PROCEDURAL_NAME = "SOMA_procedural_transforms.json"
 
 _SCHEMA = 1
-_RESTORE = "Restore it with `git checkout -- assets`, or make it again with `soma assets build`"
+RESTORE = "Restore it with `git checkout -- assets`, or install soma-body-core again"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -56,17 +57,17 @@ def read_manifest(root: Path) -> Manifest:
         AssetError: missing, not JSON, of another schema, or without a required key.
     """
     path = root / MANIFEST_NAME
-    refuse_unreadable(path, fix=_RESTORE)
+    refuse_unreadable(path, fix=RESTORE)
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
     except (ValueError, RecursionError) as error:
-        raise AssetError(path, cause=f"not valid JSON ({error})", fix=_RESTORE) from error
+        raise AssetError(path, cause=f"not valid JSON ({error})", fix=RESTORE) from error
     schema = content.get("schema") if isinstance(content, dict) else None
     if schema != _SCHEMA:
-        raise AssetError(path, cause=f"manifest schema is {schema}, expected {_SCHEMA}", fix=_RESTORE)
+        raise AssetError(path, cause=f"manifest schema is {schema}, expected {_SCHEMA}", fix=RESTORE)
     missing = [key for key in ("rig_hash", "rig_revision", "files") if key not in content]
     if missing:
-        raise AssetError(path, cause=f"missing keys {missing}", fix=_RESTORE)
+        raise AssetError(path, cause=f"missing keys {missing}", fix=RESTORE)
     return Manifest(
         rig_hash=content["rig_hash"], rig_revision=content["rig_revision"], files=content["files"]
     )
@@ -81,7 +82,7 @@ def write_manifest(root: Path, manifest: Manifest) -> None:
         "files": {name: dict(entry) for name, entry in manifest.files.items()},
     }
     text = json.dumps(content, indent=2, sort_keys=True) + "\n"
-    atomic_write(root / MANIFEST_NAME, lambda temporary: temporary.write_text(text, encoding="utf-8"))
+    atomic_text(root / MANIFEST_NAME, text)
 
 
 def verified_sha256(root: Path, manifest: Manifest, name: str) -> str:
@@ -92,18 +93,18 @@ def verified_sha256(root: Path, manifest: Manifest, name: str) -> str:
     """
     path = root / name
     if name not in manifest.files:
-        raise AssetError(root / MANIFEST_NAME, cause=f"does not list {name}", fix=_RESTORE)
-    refuse_unreadable(path, fix=_RESTORE)
+        raise AssetError(root / MANIFEST_NAME, cause=f"does not list {name}", fix=RESTORE)
+    refuse_unreadable(path, fix=RESTORE)
     expected = manifest.files[name]
     size = path.stat().st_size
     if size != expected["size"]:
         state = "truncated" if size < expected["size"] else "not the shipped one"
         cause = f"file is {state}: {size} bytes, expected {expected['size']}"
-        raise AssetError(path, cause=cause, fix=_RESTORE)
+        raise AssetError(path, cause=cause, fix=RESTORE)
     got = file_sha256(path)
     if got != expected["sha256"]:
         cause = f"SHA-256 is {got[:16]}..., expected {expected['sha256'][:16]}..."
-        raise AssetError(path, cause=cause, fix=_RESTORE)
+        raise AssetError(path, cause=cause, fix=RESTORE)
     return got
 
 

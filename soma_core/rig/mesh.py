@@ -8,6 +8,8 @@ from typing import Literal
 
 import numpy as np
 
+from soma_core.geometry.mesh import polygon_sides, unique_edges
+
 __all__ = ["CanonicalMesh", "Lod"]
 
 Lod = Literal["mid", "low", "xlo"]
@@ -46,6 +48,10 @@ class CanonicalMesh:
     def vertex_count(self) -> int:
         """Number of vertices at this LOD."""
         return len(self.vertices)
+
+    def edges(self) -> np.ndarray:
+        """Edges of the polygons, each once, smaller id first, (e, 2) int64."""
+        return unique_edges(polygon_sides(self.face_vert_indices, self.face_vert_counts))
 
     @property
     def face_interior(self) -> np.ndarray:

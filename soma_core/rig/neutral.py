@@ -10,11 +10,10 @@ from typing import Any
 
 import numpy as np
 
-from soma_core.cache import atomic_write
 from soma_core.errors import AssetError, InputError
 from soma_core.npz import open_npz_file
 from soma_core.paths import assets_dir
-from soma_core.rig.manifest import NEUTRAL_NAME, read_manifest, verified_sha256
+from soma_core.rig.manifest import NEUTRAL_NAME, RESTORE, read_manifest, verified_sha256
 
 __all__ = [
     "SEGMENT_NAMES",
@@ -23,7 +22,6 @@ __all__ = [
     "load_shape_space",
     "read_arrays",
     "read_topology",
-    "write_neutral",
 ]
 
 SEGMENT_NAMES = (
@@ -115,18 +113,17 @@ def read_arrays(path: Path, names: Iterable[str]) -> dict[str, np.ndarray]:
     Raises:
         AssetError: unreadable file or missing keys.
     """
-    fix = "Restore the file, or make it again with `soma assets build`"
-    with open_npz_file(path, fix=fix) as file:
+    with open_npz_file(path, fix=RESTORE) as file:
         missing = [name for name in names if name not in file.names]
         if missing:
-            raise AssetError(path, cause=f"missing keys {missing}", fix=fix)
+            raise AssetError(path, cause=f"missing keys {missing}", fix=RESTORE)
         wanted = [*names, *(["metadata"] if "metadata" in file.names else [])]
         found = {}
         for name in wanted:
             try:
                 found[name] = file.read(name)
             except ValueError as error:
-                raise AssetError(path, cause=f"{name} cannot be read ({error})", fix=fix) from error
+                raise AssetError(path, cause=f"{name} cannot be read ({error})", fix=RESTORE) from error
     return found
 
 
@@ -184,31 +181,3 @@ def load_shape_space(path: Path | str | None = None) -> ShapeSpace:
         return ShapeSpace(**values, metadata=metadata if trained is None else trained)
     except (InputError, ValueError) as error:
         raise AssetError(path, cause=str(error).rstrip("."), fix="Restore the file") from error
-
-
-def write_neutral(
-    path: Path, topology: Mapping[str, np.ndarray], shape_space: ShapeSpace, metadata: Mapping[str, Any]
-) -> None:
-    """Write ``SOMA_neutral.npz``: deflated, no timestamps, keys sorted, atomic.
-
-    Args:
-        path: the file.
-        topology: the arrays of `TOPOLOGY_KEYS`.
-        shape_space: mean, directions and eigenvalues [cm].
-        metadata: stored as JSON; the shape space's own goes under ``provenance.shape_space``.
-
-    Raises:
-        InputError: `topology` lacks a key.
-    """
-    missing = [name for name in TOPOLOGY_KEYS if name not in topology]
-    if missing:
-        raise InputError(
-            "topology", got=f"no {missing}", expected="every key of TOPOLOGY_KEYS", fix="Add the arrays."
-        )
-    provenance = {**metadata.get("provenance", {}), "shape_space": dict(shape_space.metadata)}
-    text = json.dumps({**metadata, "provenance": provenance}, sort_keys=True)
-    arrays = {name: np.asarray(topology[name]) for name in TOPOLOGY_KEYS}
-    arrays |= {key: np.asarray(getattr(shape_space, key), np.float32) for key in _SHAPE_KEYS}
-    arrays["metadata"] = np.array(text)
-    ordered = {name: arrays[name] for name in sorted(arrays)}
-    atomic_write(path, lambda temporary: np.savez_compressed(temporary, **ordered))

@@ -11,6 +11,7 @@ from typing import Any
 
 from soma_core.errors import AssetError
 from soma_core.files import refuse_unreadable
+from soma_core.rig.manifest import RESTORE
 from soma_core.rig.procedural import MODES, ProceduralDefinition, TwistMode, TwistSegment
 
 __all__ = ["parse_procedural", "read_procedural"]
@@ -67,7 +68,7 @@ class _Field:
             raise self.refuse("a non-empty array")
         return [self.at(index) for index in range(len(self.value))]
 
-    def one_of(self, choices: Sequence[str], meaning: str) -> str:
+    def one_of(self, choices: Sequence[str], meaning: str) -> Any:
         """The value as one of the given texts."""
         if not isinstance(self.value, str) or self.value not in choices:
             raise self.refuse(meaning)
@@ -278,10 +279,9 @@ def read_procedural(path: Path | str) -> ProceduralDefinition:
         AssetError: unreadable file, or a field that is not as the schema says.
     """
     path = Path(path)
-    fix = "Restore the file, or make it again with `soma assets build`"
-    refuse_unreadable(path, fix=fix)
+    refuse_unreadable(path, fix=RESTORE)
     try:
         document = json.loads(path.read_text(encoding="utf-8"))
     except (ValueError, RecursionError) as error:
-        raise AssetError(path, cause=f"not valid JSON ({error})", fix=fix) from error
+        raise AssetError(path, cause=f"not valid JSON ({error})", fix=RESTORE) from error
     return parse_procedural(document, path)

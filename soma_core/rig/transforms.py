@@ -1,7 +1,7 @@
-"""Joint transforms at the asset boundary: local and world, and rotations made exact.
+"""Joint transforms at the asset boundary: local ones to world, and rotations made exact.
 
-Local and world transforms are converted with correctly rounded or plain scalar arithmetic instead
-of BLAS, so that the same file gives the same bits, and the same rig hash, on every machine.
+World transforms are composed with plain scalar arithmetic instead of BLAS, so that the same file gives the
+same bits, and the same rig hash, on every machine.
 """
 
 from __future__ import annotations
@@ -10,45 +10,9 @@ from fractions import Fraction
 
 import numpy as np
 
-__all__ = ["depth_order", "fused_product", "local_transforms", "project_rotations", "world_transforms"]
+from soma_core.geometry.tree import depth_order
 
-_Matrix = list[list[Fraction]]
-
-
-def _inverse_affine(matrix: _Matrix) -> _Matrix:
-    """Invert a 4x4 affine matrix exactly, by cofactors of its 3x3 part."""
-    a = [row[:3] for row in matrix[:3]]
-    cofactor = [
-        [
-            a[(i + 1) % 3][(j + 1) % 3] * a[(i + 2) % 3][(j + 2) % 3]
-            - a[(i + 1) % 3][(j + 2) % 3] * a[(i + 2) % 3][(j + 1) % 3]
-            for j in range(3)
-        ]
-        for i in range(3)
-    ]
-    determinant = sum(a[0][j] * cofactor[0][j] for j in range(3))
-    linear = [[cofactor[j][i] / determinant for j in range(3)] for i in range(3)]
-    shift = [-sum(linear[i][j] * matrix[j][3] for j in range(3)) for i in range(3)]
-    return [[*linear[i], shift[i]] for i in range(3)] + [[Fraction(0)] * 3 + [Fraction(1)]]
-
-
-def local_transforms(world: np.ndarray, parents: np.ndarray) -> np.ndarray:
-    """Return local transforms ``inv(world[parent]) @ world``, correctly rounded.
-
-    Args:
-        world: (J, 4, 4) affine, column vectors.
-        parents: (J,) int, -1 for a root.
-    """
-    exact = [[[Fraction(value) for value in row] for row in matrix] for matrix in world.tolist()]
-    local = np.array(world, np.float64)
-    for joint, parent in enumerate(parents.tolist()):
-        if parent < 0:
-            continue
-        inverse = _inverse_affine(exact[parent])
-        for i in range(4):
-            for j in range(4):
-                local[joint, i, j] = float(sum(inverse[i][k] * exact[joint][k][j] for k in range(4)))
-    return local
+__all__ = ["fused_product", "project_rotations", "world_transforms"]
 
 
 def fused_product(left: np.ndarray, right: np.ndarray) -> np.ndarray:
@@ -70,17 +34,6 @@ def fused_product(left: np.ndarray, right: np.ndarray) -> np.ndarray:
                     for sum_before, value in zip(product[row].tolist(), values, strict=True)
                 ]
     return product
-
-
-def depth_order(parents: np.ndarray) -> np.ndarray:
-    """Return the stable order of joints by depth, so that parents come before children."""
-    depth = []
-    for joint in range(len(parents)):
-        steps, ancestor = 0, int(parents[joint])
-        while ancestor >= 0:
-            steps, ancestor = steps + 1, int(parents[ancestor])
-        depth.append(steps)
-    return np.argsort(depth, kind="stable")
 
 
 def world_transforms(local: np.ndarray, parents: np.ndarray) -> np.ndarray:

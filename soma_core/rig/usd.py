@@ -13,6 +13,7 @@ from soma_core.errors import AssetError
 from soma_core.files import refuse_unreadable
 from soma_core.rig.expansion import public_rig, with_helpers
 from soma_core.rig.influences import read_weights
+from soma_core.rig.manifest import RESTORE
 from soma_core.rig.mesh import Lod
 from soma_core.rig.procedural import ProceduralDefinition
 from soma_core.rig.skeleton import Rig
@@ -73,7 +74,7 @@ class _Skeleton:
 def _open(path: Path) -> Usd.Stage:
     from pxr import Tf, Usd
 
-    refuse_unreadable(path, fix="Restore the file, or make it again with `soma assets build`")
+    refuse_unreadable(path, fix=RESTORE)
     try:
         return Usd.Stage.Open(str(path))
     except Tf.ErrorException as error:
@@ -250,7 +251,7 @@ def _read_stored(path: Path, stage: Usd.Stage, skin: Usd.Prim) -> StoredRig:
     """The skeleton with the points and weights of a skin, in the unit and axes of the file."""
     from pxr import UsdGeom
 
-    up = str(UsdGeom.GetStageUpAxis(stage))
+    up = UsdGeom.GetStageUpAxis(stage)
     if up not in ("Y", "Z"):
         raise AssetError(path, cause=f"upAxis is {up}, expected Y or Z", fix="Export it again with +Y up")
     skeleton = _read_skeleton(path, _skeleton_prim(path, stage, skin))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import importlib.util
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import TypedDict
+from typing import Literal, TypedDict
 
 import numpy as np
 
@@ -65,7 +65,10 @@ def plot_errors(rows: Sequence[ErrorRow], path: Path) -> bool:
 
     figure = Figure(figsize=(6, 4), layout="constrained")
     axes = figure.add_subplot()
-    for key, label in (("mean_mm", "mean"), ("p95_mm", "95th percentile"), ("max_mm", "largest")):
+    lines: tuple[tuple[Literal["mean_mm", "p95_mm", "max_mm"], str], ...] = (
+        ("mean_mm", "mean"), ("p95_mm", "95th percentile"), ("max_mm", "largest"),
+    )  # fmt: skip
+    for key, label in lines:
         axes.loglog([row["components"] for row in rows], [row[key] for row in rows], marker="o", label=label)
     axes.xaxis.set_major_locator(FixedLocator([row["components"] for row in rows]))
     axes.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))

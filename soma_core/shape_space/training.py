@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from soma_core.cache import atomic_write
+from soma_core.cache import atomic_arrays
 from soma_core.errors import InputError
 from soma_core.shape_space.mirror import mirror_shapes
 from soma_core.shape_space.sampling import TRAINING, IdentityStream
@@ -144,8 +144,8 @@ def train_components(
 
 
 def _save(pca: IncrementalPCA, state: Path, key: str, done: int) -> None:
-    arrays: Mapping[str, np.ndarray] = {name: np.asarray(getattr(pca, name)) for name in _FITTED}
-    atomic_write(state, lambda path: np.savez(path, key=np.array(key), done=np.array(done), **arrays))
+    arrays = {name: np.asarray(getattr(pca, name)) for name in _FITTED}
+    atomic_arrays(state, {"key": np.array(key), "done": np.array(done)} | arrays, compressed=False)
 
 
 def _restore(pca: IncrementalPCA, state: Path, key: str) -> int:

@@ -12,9 +12,9 @@ import torch
 
 from soma_core.backends.parameters import batch_parameters
 from soma_core.errors import InputError
+from soma_core.obj import read_obj
 from soma_core.plugin.registry import Registry
 from soma_core.plugin.spec import HasTriangles
-from soma_core.topology.wrap_pair import read_obj
 
 __all__ = ["NativeMesh", "neutral_mesh"]
 

@@ -13,7 +13,7 @@ import numpy as np
 import scipy.ndimage
 
 from soma_core.errors import SomaError
-from soma_core.io.clip import vertex_normals
+from soma_core.geometry.mesh import vertex_normals
 
 if TYPE_CHECKING:
     from PIL.Image import Image

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from omegaconf import DictConfig, OmegaConf
 
-from soma_core import __version__
+from soma_core._version import __version__
 from soma_core.cache import atomic_write, content_key
 from soma_core.correctives.data import ClipPlan, LessonStore, Split, plan_clips, split_clips
 from soma_core.correctives.finish import Masks, entry_budget, finished

@@ -83,7 +83,7 @@ def run(config: DictConfig, output: Path) -> None:
 
 
 def write_shape_space(path: Path, space: ShapeSpace) -> None:
-    """Write a shape-space file; ``soma assets build --shape-space FILE`` rounds it and merges it."""
+    """Write a shape-space file; ``python -m assets.make --shape-space FILE`` rounds it and merges it."""
     arrays = {"mean": space.mean, "shapedirs": space.shapedirs, "eigenvalues": space.eigenvalues}
     text = json.dumps(dict(space.metadata), sort_keys=True)
     atomic_write(path, lambda part: np.savez_compressed(part, metadata=np.array(text), **arrays))

@@ -14,6 +14,7 @@ import numpy as np
 from soma_core.cache import atomic_write
 from soma_core.errors import AssetError, InputError
 from soma_core.io.mesh_vertices import read_mesh_vertices
+from soma_core.obj import read_obj
 from soma_core.plugin.registry import default_registry
 from soma_core.plugin.spec import WrapPair
 from soma_core.registration.quality import Quality, measure
@@ -22,7 +23,6 @@ from soma_core.rig import load_canonical
 from soma_core.rig.mesh import CanonicalMesh
 from soma_core.tasks.animate import given_params
 from soma_core.tasks.neutral_mesh import NativeMesh, neutral_mesh
-from soma_core.topology.wrap_pair import read_obj
 
 if TYPE_CHECKING:
     from omegaconf import DictConfig

@@ -11,7 +11,7 @@ import numpy as np
 
 from soma_core.cache import atomic_write
 from soma_core.errors import SomaError
-from soma_core.io.clip import vertex_normals
+from soma_core.geometry.mesh import vertex_normals
 from soma_core.registration.quality import Quality
 from soma_core.registration.register import Registration
 from soma_core.rig.mesh import CanonicalMesh

@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from soma_core.errors import InputError
+from soma_core.obj import write_obj
 from soma_core.plugin.registry import Registry, default_registry
 from soma_core.rig import load_canonical
 
@@ -119,9 +120,7 @@ def _write_model(folder: Path) -> None:
     """Write the wrap pair and the linear model; the model's mesh is the canonical one at its low LOD."""
     native, wrap = load_canonical("low")[0], load_canonical("mid")[0]
     for name, mesh in (("native.obj", native), ("wrap.obj", wrap)):
-        lines = [f"v {x:.6f} {y:.6f} {z:.6f}" for x, y, z in mesh.vertices.tolist()]
-        lines += [f"f {a} {b} {c}" for a, b, c in (mesh.triangles + 1).tolist()]
-        (folder / name).write_text("\n".join(lines) + "\n", encoding="ascii")
+        write_obj(folder / name, mesh.vertices, mesh.triangles, digits=6)
     template = native.vertices.round(6)
     directions = np.stack([0.05 * template, 0.08 * template * [1, 0, 1]])
     np.savez_compressed(folder / "model.npz", template=template, directions=directions)

@@ -14,6 +14,7 @@ from torch import Tensor
 
 from soma_core.errors import InputError
 from soma_core.layer import SomaLayer
+from soma_core.obj import read_obj
 from soma_core.plugin.discovery import Offer
 from soma_core.plugin.registry import Registry, default_registry
 from soma_core.plugin.spec import BackendSpec, Generator, Parameter
@@ -26,7 +27,6 @@ from soma_core.testing.samples import Change, changed_rows, random_rows
 from soma_core.topology.correspondence import Correspondence, load_correspondence
 from soma_core.topology.frames import METRES, native_to_canonical
 from soma_core.topology.transfer import filled_vertices
-from soma_core.topology.wrap_pair import read_obj
 
 __all__ = ["CPU", "Bodies", "Context", "WrapMeshes"]
 

@@ -29,7 +29,7 @@ class _Part:
 
 def _numpy_state() -> tuple[Any, ...]:
     name, key, *rest = np.random.get_state()  # noqa: NPY002 - the global one is the one to watch
-    return (name, key.tobytes(), *rest)
+    return (name, np.asarray(key).tobytes(), *rest)
 
 
 def _set_numpy_state(state: tuple[Any, ...]) -> None:
@@ -68,7 +68,7 @@ def _set_logging_state(state: tuple[int, tuple[logging.Handler, ...]]) -> None:
 
 
 def _set_filters(filters: list[Any]) -> None:
-    warnings.filters[:] = filters
+    warnings.filters[:] = filters  # type: ignore[index]
     warnings._filters_mutated()  # type: ignore[attr-defined]
 
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
-from soma_core.testing.conformance import Check, Level
+from soma_core.plugin.checks import Check, Level
 
 __all__ = ["Outcome", "Report", "State"]
 

@@ -13,13 +13,13 @@ from pathlib import Path
 from typing import Any
 
 from soma_core.errors import AssetError, InputError
+from soma_core.plugin.checks import Check, CheckFailedError, Level
 from soma_core.plugin.declaration import did_you_mean
 from soma_core.plugin.errors import BackendError, BrokenBackendError
 from soma_core.plugin.registry import Registry, default_registry
 from soma_core.rig.mesh import CanonicalMesh
 from soma_core.rig.skeleton import Rig
 from soma_core.testing.checks import CORE_CHECKS
-from soma_core.testing.conformance import Check, CheckFailedError, Level
 from soma_core.testing.context import Context
 from soma_core.testing.global_state import kept
 from soma_core.testing.report import Outcome, Report, State

@@ -6,10 +6,10 @@ from collections.abc import Mapping
 from typing import Any
 
 from soma_core.errors import SomaError
+from soma_core.plugin.checks import CheckFailedError, Level
 from soma_core.plugin.registry import Registry
 from soma_core.rig.mesh import CanonicalMesh
 from soma_core.rig.skeleton import Rig
-from soma_core.testing.conformance import CheckFailedError, Level
 from soma_core.testing.report import Outcome
 from soma_core.testing.run import ConformanceRun
 

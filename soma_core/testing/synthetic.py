@@ -17,8 +17,8 @@ import scipy.sparse
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from soma_core.cache import atomic_write
 from soma_core.io.joint_order import PARENT_NAMES
+from soma_core.obj import write_obj
 from soma_core.plugin.spec import WrapPair
 from soma_core.rig.mesh import CanonicalMesh
 from soma_core.rig.skeleton import Rig
@@ -27,7 +27,6 @@ __all__ = [
     "NATIVE_FROM_CANONICAL",
     "synthetic_canonical",
     "synthetic_native",
-    "write_obj",
     "write_wrap_pair",
 ]
 
@@ -138,14 +137,14 @@ def _surface_net(step: float, turn: np.ndarray) -> tuple[np.ndarray, np.ndarray]
     ticks = [step * np.arange(-count, count + 1) for count in reach]
     nodes = np.stack(np.meshgrid(*ticks, indexing="ij"), -1)
     inside = _distance(nodes @ turn.T + _CENTRE)[0] < 0
-    quads = []
+    found = []
     for axis in range(3):
         leaves = np.diff(inside.astype(np.int8), axis=axis)
         first, second = np.eye(3, dtype=int)[[(axis + 1) % 3, (axis + 2) % 3]]
         for sign in (-1, 1):  # grid edges that leave the body, then those that enter it
             cell = np.argwhere(leaves == sign)
-            quads.append(np.stack([cell, cell - first, cell - first - second, cell - second][::-sign], 1))
-    cells, ids = np.unique(np.concatenate(quads).reshape(-1, 3), axis=0, return_inverse=True)
+            found.append(np.stack([cell, cell - first, cell - first - second, cell - second][::-sign], 1))
+    cells, ids = np.unique(np.concatenate(found).reshape(-1, 3), axis=0, return_inverse=True)
     quads = ids.reshape(-1, 4)
     vertices = step * (cells + 0.5 - reach) @ turn.T + _CENTRE
     for _ in range(_SMOOTHINGS):  # evens the spacing: towards the neighbours, then back to the surface
@@ -278,14 +277,6 @@ def _wrap() -> np.ndarray:
     wrap = closest_point_on_triangle(ideal, native[triangles[face]])
     wrap[mesh.face_interior] = ideal[mesh.face_interior]
     return wrap
-
-
-def write_obj(path: Path | str, vertices: np.ndarray, triangles: np.ndarray) -> Path:
-    """Write a triangle mesh as an OBJ that reads back bit for bit."""
-    lines = [f"v {x!r} {y!r} {z!r}" for x, y, z in vertices.tolist()]
-    lines += [f"f {a} {b} {c}" for a, b, c in (np.asarray(triangles) + 1).tolist()]
-    atomic_write(Path(path), lambda temporary: temporary.write_text("\n".join(lines) + "\n") and None)
-    return Path(path)
 
 
 def write_wrap_pair(folder: Path | str) -> WrapPair:

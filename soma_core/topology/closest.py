@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 
 from soma_core.geometry.barycentric import closest_point_on_triangle
-from soma_core.kernels.closest_point_wp import closest_faces
 
 __all__ = ["ClosestFaces"]
 
@@ -33,6 +32,8 @@ class ClosestFaces:
 
     def query(self, points: np.ndarray) -> np.ndarray:
         """Id of the closest face of each point; (m, 3) -> (m,) int64."""
+        from soma_core.kernels.closest_point_wp import closest_faces  # Warp, needed for building only
+
         centre = self._vertices.mean(0)
         scale = float(np.abs(self._vertices - centre).max()) or 1.0
         proposed = closest_faces(

@@ -11,10 +11,11 @@ from soma_core.cache import cached_arrays, content_key, file_sha256
 from soma_core.errors import InputError
 from soma_core.files import refuse_unreadable
 from soma_core.geometry.barycentric import closest_point_on_triangle, tetrahedral_coordinates
+from soma_core.obj import read_obj
 from soma_core.plugin.spec import WrapPair
 from soma_core.rig.mesh import CanonicalMesh
 from soma_core.topology.closest import ClosestFaces
-from soma_core.topology.wrap_pair import check_wrap, read_obj
+from soma_core.topology.wrap_pair import check_wrap
 
 __all__ = ["Correspondence", "affine_matrix", "build_correspondence", "load_correspondence"]
 

@@ -127,6 +127,8 @@ def _build_region(
 class FillOperator(torch.nn.Module):
     """Applies the fills of all regions to vertices laid out as (v, f): any number of columns."""
 
+    free_vertices: Tensor
+
     def __init__(
         self, regions: tuple[RegionFill, ...], *, dtype: torch.dtype, device: torch.device | str
     ) -> None:

@@ -59,6 +59,11 @@ class LodTransfer(torch.nn.Module):
         source_ids: ids of the source vertices that any target vertex depends on, sorted, (s,).
     """
 
+    source_ids: Tensor
+    corners: Tensor
+    shares: Tensor
+    height: Tensor
+
     def __init__(
         self, source: CanonicalMesh, target: CanonicalMesh, *, dtype: torch.dtype, device: torch.device | str
     ) -> None:

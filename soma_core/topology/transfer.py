@@ -43,6 +43,10 @@ class TopologyTransfer(torch.nn.Module):
         mesh: canonical mesh at the same LOD.
     """
 
+    corners: Tensor
+    height: Tensor
+    frame: Tensor
+
     def __init__(
         self,
         correspondence: Correspondence,
@@ -98,6 +102,9 @@ class TopologyTransfer(torch.nn.Module):
 
 class CanonicalPassThrough(torch.nn.Module):
     """The transfer of a backend whose native topology is the canonical one: a change of unit and axes."""
+
+    frame: Tensor
+    mid_ids: Tensor
 
     def __init__(
         self, spec: BackendSpec, mesh: CanonicalMesh, *, dtype: torch.dtype, device: torch.device | str

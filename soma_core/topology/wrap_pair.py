@@ -6,96 +6,21 @@ from pathlib import Path
 
 import numpy as np
 
-from soma_core.errors import AssetError, InputError
-from soma_core.files import refuse_unreadable
+from soma_core.errors import InputError
+from soma_core.geometry.mesh import triangle_sides
 from soma_core.rig.mesh import CanonicalMesh
 
 __all__ = [
-    "canonical_edges",
     "check_count",
     "check_faces",
     "check_order",
     "check_wrap",
-    "read_obj",
 ]
 
-_MOST_BYTES = 256 * 2**20
-"""A hundred times the largest pair; an OBJ unfolds to some ten times its size in memory."""
 
-
-def read_obj(path: Path | str) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices (n, 3) float64 and triangles (t, 3) int64 of an OBJ, in the file's order.
-
-    Only ``v`` and ``f`` lines are read, so texture seams, normals, groups and materials neither split nor
-    reorder vertices, as they do in mesh libraries. Polygons become fans.
-
-    Raises:
-        AssetError: missing, a git-LFS pointer, not an OBJ mesh, or not finite.
-    """
-    refuse_unreadable(path, fix="Reinstall the backend or name another file.", most_bytes=_MOST_BYTES)
-    text = Path(path).read_text(encoding="utf-8", errors="replace").replace("\\\n", " ")
-    points: list[list[float]] = []
-    faces: list[tuple[int, int, int]] = []
-    for number, line in enumerate(text.splitlines(), 1):
-        kind, *fields = line.split() or [""]
-        try:
-            if kind == "v":
-                points.append(_point(fields))
-            elif kind == "f":
-                faces += _fan(fields, len(points))
-        except ValueError as error:
-            raise AssetError(
-                path, cause=f"line {number} is {line:.60}", fix="Export the mesh again."
-            ) from error
-    if not points or not faces:
-        raise AssetError(path, cause="holds no mesh", fix="Export it again with vertices and faces.")
-    vertices, triangles = np.array(points, np.float64), np.array(faces, np.int64)
-    if triangles.min() < 0 or triangles.max() >= len(vertices):
-        strange = triangles.max() if triangles.max() >= len(vertices) else triangles.min()
-        cause = f"a face refers to vertex {strange + 1} of {len(vertices)}"
-        raise AssetError(path, cause=cause, fix="Export the mesh again.")
-    if not np.isfinite(vertices).all():
-        bad = int(np.flatnonzero(~np.isfinite(vertices).all(1))[0])
-        raise AssetError(path, cause=f"vertex {bad} is not finite", fix="Export the mesh again.")
-    return vertices, triangles
-
-
-def _point(fields: list[str]) -> list[float]:
-    """Coordinates of a ``v`` line; vertex colours that may follow are left out."""
-    if len(fields) < 3:
-        raise ValueError(fields)
-    return [float(field) for field in fields[:3]]
-
-
-def _fan(fields: list[str], count: int) -> list[tuple[int, int, int]]:
-    """Triangles of an ``f`` line; indices count from 1, or backwards from the last of `count` vertices."""
-    if len(fields) < 3:
-        raise ValueError(fields)
-    numbers = [int(field.partition("/")[0]) for field in fields]
-    if max(map(abs, numbers)) >= 2**31:
-        raise ValueError(fields)
-    ids = [number - 1 if number > 0 else number + count for number in numbers]
-    return [(ids[0], ids[i], ids[i + 1]) for i in range(1, len(ids) - 1)]
-
-
-def canonical_edges(mesh: CanonicalMesh) -> tuple[np.ndarray, np.ndarray]:
-    """Both ends (e,) of every polygon edge, each edge once."""
-    edges = _canonical_edges(mesh)
-    return edges >> 32, edges & 0xFFFFFFFF
-
-
-def _canonical_edges(mesh: CanonicalMesh) -> np.ndarray:
-    """Polygon edges as sorted, unique 64-bit keys."""
-    starts = np.concatenate([[0], np.cumsum(mesh.face_vert_counts)[:-1]])
-    corner = np.arange(len(mesh.face_vert_indices))
-    face = np.repeat(np.arange(len(starts)), mesh.face_vert_counts)
-    following = starts[face] + (corner - starts[face] + 1) % mesh.face_vert_counts[face]
-    return np.unique(_edge_keys(mesh.face_vert_indices, mesh.face_vert_indices[following]))
-
-
-def _edge_keys(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    low, high = np.minimum(a, b).astype(np.int64), np.maximum(a, b).astype(np.int64)
-    return low << 32 | high
+def _edge_keys(sides: np.ndarray) -> np.ndarray:
+    ids = sides.astype(np.int64)
+    return ids.min(1) << 32 | ids.max(1)
 
 
 def check_wrap(vertices: np.ndarray, triangles: np.ndarray, mesh: CanonicalMesh, *, path: Path) -> None:
@@ -118,9 +43,7 @@ def check_count(vertices: np.ndarray, mesh: CanonicalMesh, *, path: Path) -> Non
 
 def check_faces(triangles: np.ndarray, mesh: CanonicalMesh, *, path: Path) -> None:
     """Refuse faces that are no part of a canonical polygon; its diagonals are free."""
-    canonical = _canonical_edges(mesh)
-    keys = [_edge_keys(triangles[:, i], triangles[:, j]) for i, j in ((0, 1), (1, 2), (2, 0))]
-    on_edges = sum(np.isin(key, canonical).astype(int) for key in keys)
+    on_edges = np.isin(_edge_keys(triangle_sides(triangles)), _edge_keys(mesh.edges())).reshape(3, -1).sum(0)
     strange = int((on_edges < 2).sum())
     if strange:
         raise InputError(
@@ -133,7 +56,7 @@ def check_faces(triangles: np.ndarray, mesh: CanonicalMesh, *, path: Path) -> No
 
 def check_order(vertices: np.ndarray, mesh: CanonicalMesh, *, path: Path) -> None:
     """Catch a permutation applied to vertices and not to faces: neighbours would lie far apart."""
-    start, end = canonical_edges(mesh)
+    start, end = mesh.edges().T
 
     def relative(points: np.ndarray) -> float:
         diagonal = float(np.linalg.norm(np.ptp(points, axis=0))) or 1.0

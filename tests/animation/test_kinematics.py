@@ -8,11 +8,11 @@ from scipy.spatial.transform import Rotation
 from soma_core.animation.kinematics import (
     Kinematics,
     absolute_from_relative,
-    joint_levels,
     relative_from_absolute,
     to_homogeneous,
 )
 from soma_core.geometry.rotations import orthonormality_error
+from soma_core.geometry.tree import joint_levels
 from soma_core.rig import load_canonical
 from tests.bodies import CPU, randn, tiny_canonical
 

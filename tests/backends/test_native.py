@@ -71,7 +71,7 @@ def test_declaring_does_not_import_torch():
 
 def test_unreadable_shape_space_is_named(tmp_path):
     path = tmp_path / "SOMA_neutral.npz"
-    with pytest.raises(AssetError, match=r"SOMA_neutral.npz: file is missing.*soma assets build"):
+    with pytest.raises(AssetError, match=r"SOMA_neutral.npz: file is missing.*git checkout -- assets"):
         component_count(path)
     path.write_bytes(b"version https://git-lfs.github.com/spec/v1")
     with pytest.raises(AssetError, match="git-LFS pointer"):

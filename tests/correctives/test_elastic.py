@@ -6,10 +6,11 @@ import torch
 
 from soma_core.correctives.bind_body import BindBody, pulled_back
 from soma_core.correctives.elastic import ElasticSurface
-from soma_core.correctives.frames import SurfaceFrames, diffused, random_walk, surface_frames_reference
-from soma_core.correctives.masks import geodesic_falloff, mesh_edges
+from soma_core.correctives.frames import SurfaceFrames, diffused, surface_frames_reference
+from soma_core.correctives.masks import geodesic_falloff
 from soma_core.correctives.sections import Sections
 from soma_core.correctives.teacher import Clip, ElasticTeacher
+from soma_core.geometry.laplacian import random_walk
 from soma_core.geometry.rotations import axis_angle_to_matrix
 from soma_core.kernels.surface_frames_wp import surface_frames
 from tests.bodies import randn
@@ -77,7 +78,7 @@ def test_offsets_across_a_flat_fold_stay_finite():
 
 def test_frames_of_a_rigid_body_are_its_rotation(body):
     skin = BindBody(body.rig)
-    laplacian = random_walk(mesh_edges(body.mesh), body.mesh.vertex_count)
+    laplacian = random_walk(body.mesh.edges(), body.mesh.vertex_count)
     frames = SurfaceFrames(body.rig.bind_shape, skin.weights, laplacian, step=2.0, rounds=2, kernels="torch")
     turn = axis_angle_to_matrix(torch.tensor([0.3, -1.0, 0.6], dtype=torch.float64))
     move = torch.cat((turn, torch.tensor([[0.1], [2.0], [0.3]], dtype=torch.float64)), 1)
@@ -88,7 +89,7 @@ def test_frames_of_a_rigid_body_are_its_rotation(body):
 
 def test_the_kernel_equals_its_twin(body):
     skin = BindBody(body.rig)
-    laplacian = random_walk(mesh_edges(body.mesh), body.mesh.vertex_count)
+    laplacian = random_walk(body.mesh.edges(), body.mesh.vertex_count)
     frames = SurfaceFrames(body.rig.bind_shape, skin.weights, laplacian, step=2.0, rounds=2)
     transforms = skin.transforms(axis_angle_to_matrix(0.4 * randn(3, body.rig.joint_count - 1, 3)))
     constants = (frames.crow, frames.col, frames.moments, frames.centre)
@@ -98,7 +99,7 @@ def test_the_kernel_equals_its_twin(body):
 
 
 def test_smoothing_keeps_constants_and_shrinks_differences(body):
-    laplacian = random_walk(mesh_edges(body.mesh), body.mesh.vertex_count)
+    laplacian = random_walk(body.mesh.edges(), body.mesh.vertex_count)
     values = np.stack([np.ones(body.mesh.vertex_count), body.mesh.vertices[:, 0]], 1)
     smooth = diffused(values, laplacian, step=1.0, rounds=3)
     np.testing.assert_allclose(smooth[:, 0], 1, atol=ROUNDING)

@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from soma_core.correctives.masks import geodesic_falloff, mesh_edges, vertex_mask
+from soma_core.correctives.masks import geodesic_falloff, vertex_mask
 
 
 def test_limbs_have_creases_and_the_face_has_none(body):
@@ -57,7 +57,7 @@ def test_a_longer_reach_only_adds(body):
 
 
 def test_edges_of_polygons_close_their_loops(body):
-    edges = mesh_edges(body.mesh)
+    edges = body.mesh.edges()
     assert (edges[:, 0] < edges[:, 1]).all()
     faces, vertices = len(body.mesh.face_vert_counts), body.mesh.vertex_count
     assert vertices - len(edges) + faces == 2  # Euler's formula of a closed surface
@@ -68,4 +68,4 @@ def test_edges_of_single_polygons(body, counts):
     mesh = dataclasses.replace(
         body.mesh, face_vert_indices=np.arange(sum(counts)), face_vert_counts=np.array(counts)
     )
-    assert len(mesh_edges(mesh)) == sum(counts)
+    assert len(mesh.edges()) == sum(counts)

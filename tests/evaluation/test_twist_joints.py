@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 from omegaconf import OmegaConf
 
-from soma_core.evaluation.twist_joints import enclosed_volume, run, section_areas
+from soma_core.evaluation.twist_joints import run, section_areas
+from soma_core.geometry.mesh import enclosed_volume
 from tests.bodies import cube_sphere
 
 FACETS = 0.03

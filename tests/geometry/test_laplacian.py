@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from soma_core.geometry.laplacian import cotangent_laplacian, vertex_areas
+from soma_core.geometry.laplacian import cotangent_laplacian, random_walk, vertex_areas
 from tests.bodies import cube_sphere, tiny_canonical
 
 ROUNDING = 1e-11
@@ -95,3 +95,8 @@ def test_areas_of_vertices():
     inside = (points[:, :2] > 0).all(1) & (points[:, :2] < 1).all(1)
     np.testing.assert_allclose(areas[inside], 1 / 36, atol=ROUNDING)  # six half cells, a third of each
     np.testing.assert_allclose(areas.min(), 1 / 36 / 6, atol=ROUNDING)  # a corner with one triangle
+
+
+def test_random_walk_takes_the_mean_of_the_neighbours_away():
+    laplacian = random_walk(np.array([[0, 1], [0, 2], [1, 2], [2, 3]]), 5)
+    np.testing.assert_allclose(laplacian @ np.array([0.0, 3, 6, 9, 7]), [-4.5, 0, 2, 3, 7])  # 4 stands alone

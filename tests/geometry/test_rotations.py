@@ -12,6 +12,7 @@ from soma_core.geometry.rotations import (
     orthonormality_error,
     shortest_arc,
     skew,
+    vee,
 )
 from tests.bodies import randn
 
@@ -38,6 +39,12 @@ def vectors(angle, dtype=torch.float64):
 def test_skew_is_the_cross_product():
     a, b = randn(2, 5, 3, seed=2), randn(2, 5, 3, seed=3)
     torch.testing.assert_close((skew(a) @ b[..., None]).squeeze(-1), torch.linalg.cross(a, b))
+
+
+def test_vee_takes_the_turn_out_of_any_matrix():
+    v, symmetric = torch.randn(5, 3), torch.randn(5, 3, 3)
+    symmetric = symmetric + symmetric.mT
+    torch.testing.assert_close(vee(symmetric + skew(v)), 2 * v)
 
 
 @pytest.mark.parametrize("dtype", DTYPES)

@@ -14,18 +14,17 @@ from soma_backend_garment import _point_pca as garment
 from soma_backend_smpl._model_file import read_model
 from soma_backend_smpl.family import SMPL
 
+from assets.make.twist_template import procedural_document
 from soma_core.backends.native import component_count
 from soma_core.io import open_vertex_sequence, read_amass, read_motion
 from soma_core.io.mesh_vertices import read_mesh_vertices
 from soma_core.io.pickled_arrays import read_pickled_arrays
 from soma_core.io.sam3d import read_sam3d
-from soma_core.rig.legacy import read_legacy_rig
+from soma_core.obj import read_obj
 from soma_core.rig.manifest import MANIFEST_NAME, read_manifest
 from soma_core.rig.neutral import load_shape_space, read_topology
 from soma_core.rig.procedural_json import read_procedural
-from soma_core.rig.twist_template import procedural_document
 from soma_core.rig.usd import read_usd_rig
-from soma_core.topology.wrap_pair import read_obj
 from tests.standins.pickles import ch, csc, select, write_pickle
 
 __all__ = ["READERS", "Reader"]
@@ -100,17 +99,6 @@ def _shape_space(path: Path) -> None:
     _write_npz(
         path, mean=_vertices()[0], shapedirs=_vertices()[:2].reshape(2, -1),
         eigenvalues=np.ones(2, np.float32), metadata=np.array(json.dumps({"units": "cm"})),
-    )  # fmt: skip
-
-
-def _legacy(path: Path) -> None:
-    worlds = np.tile(np.eye(4), (2, 1, 1))
-    _write_npz(
-        path, joint_names=np.array(["Root", "Hips"]), joint_parent_ids=np.array([-1, 0]),
-        bind_pose_world=worlds, t_pose_world=worlds, bind_shape=_vertices()[0],
-        skinning_weights_data=np.ones(COUNT),
-        skinning_weights_indices=np.arange(COUNT), skinning_weights_indptr=np.array([0, 0, COUNT]),
-        skinning_weights_shape=np.array([COUNT, 2]), triangles=np.array([[0, 1, 2], [2, 3, 4]]),
     )  # fmt: skip
 
 
@@ -247,7 +235,6 @@ READERS = [
         accepts=("npz of invalid text",),
     ),
     Reader(name="topology", suffix=".npz", read=read_topology),
-    Reader(name="legacy rig", suffix=".npz", read=read_legacy_rig, good=_legacy),
     Reader(name="usd rig", suffix=".usda", read=read_usd_rig, good=_usd),
     Reader(name="procedural definition", suffix=".json", read=read_procedural, good=_procedural),
     Reader(name="manifest", suffix=".json", read=_manifest, good=_json),

@@ -8,7 +8,8 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from soma_core.errors import InputError
-from soma_core.io.clip import linear_colour, skinned_clip, vertex_normals
+from soma_core.geometry.mesh import vertex_normals
+from soma_core.io.clip import linear_colour, skinned_clip
 from soma_core.layer import SomaLayer
 from tests.bodies import randn
 

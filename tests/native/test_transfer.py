@@ -10,9 +10,9 @@ from soma_core import load_canonical
 from soma_core.errors import InputError
 from soma_core.inversion import PoseInversion
 from soma_core.native import NativeTransfer
+from soma_core.obj import read_obj
 from soma_core.plugin.errors import BackendError
 from soma_core.plugin.registry import Registry
-from soma_core.topology.wrap_pair import read_obj
 
 ROUNDING = 1e-9
 """Relative to the body: float64."""

@@ -37,7 +37,7 @@ def soma_backend():
 @hookimpl
 def soma_generator(spec, device, dtype):
     import torch
-    from soma_core.topology.wrap_pair import read_obj
+    from soma_core.obj import read_obj
 
     class Model:
         vertices = torch.as_tensor(read_obj(spec.wrap.native)[0], dtype=dtype, device=device)

@@ -8,12 +8,13 @@ import numpy as np
 import pytest
 
 from soma_core.errors import InputError
+from soma_core.obj import read_obj
 from soma_core.plugin.registry import default_registry
 from soma_core.registration.quality import Quality, measure
 from soma_core.registration.register import Registration, WrapOptions, register
 from soma_core.registration.surface import Surface
 from soma_core.rig import load_canonical
-from soma_core.topology.wrap_pair import check_order, read_obj
+from soma_core.topology.wrap_pair import check_order
 from tests.real_mhr import needs_mhr, registered_mhr
 from tests.registration.test_target import sphere
 

@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 import scipy.sparse
 
+from assets.make.twist_template import procedural_document
 from soma_core.errors import AssetError
 from soma_core.rig import load_canonical
 from soma_core.rig.expansion import expanded_rig, helper_bind, public_rig, with_helpers
 from soma_core.rig.procedural_json import parse_procedural
 from soma_core.rig.stored import StoredRig
 from soma_core.rig.transforms import world_transforms
-from soma_core.rig.twist_template import procedural_document
 from soma_core.rig.usd import read_usd_rig
 
 ROUNDING = 1e-12

@@ -28,7 +28,7 @@ def test_bad_manifests_are_refused(tmp_path, text, message):
 
 
 def test_missing_manifest_names_the_command(tmp_path):
-    with pytest.raises(AssetError, match="soma assets build"):
+    with pytest.raises(AssetError, match="git checkout -- assets"):
         read_manifest(tmp_path)
 
 

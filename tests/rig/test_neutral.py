@@ -4,16 +4,15 @@ import warnings
 import numpy as np
 import pytest
 
+from assets.make.neutral import compress_shape_space, write_neutral
 from soma_core.errors import AssetError, InputError
 from soma_core.paths import assets_dir
-from soma_core.rig.compression import compress_shape_space
 from soma_core.rig.manifest import NEUTRAL_NAME
 from soma_core.rig.neutral import (
     TOPOLOGY_KEYS,
     ShapeSpace,
     load_shape_space,
     read_topology,
-    write_neutral,
 )
 
 
@@ -75,7 +74,7 @@ def test_missing_shape_keys_are_named(tmp_path, missing):
     path = tmp_path / "bare.npz"
     keys = {"mean", "shapedirs", "eigenvalues"} - {missing}
     np.savez(path, **{name: getattr(space(), name) for name in keys})
-    with pytest.raises(AssetError, match=rf"missing keys \['{missing}'\]. .*soma assets build"):
+    with pytest.raises(AssetError, match=rf"missing keys \['{missing}'\]. .*git checkout -- assets"):
         load_shape_space(path)
 
 

@@ -6,13 +6,13 @@ from pathlib import Path
 
 import pytest
 
+from assets.make.twist_template import procedural_document
 from soma_core.errors import AssetError
 from soma_core.paths import assets_dir
 from soma_core.rig import load_canonical
 from soma_core.rig.manifest import PROCEDURAL_NAME
 from soma_core.rig.procedural import MODES
 from soma_core.rig.procedural_json import parse_procedural, read_procedural
-from soma_core.rig.twist_template import procedural_document
 
 SHARES = (0.05, 0.3333333, 0.6666667, 0.95)
 FLOAT32 = 1e-6

@@ -1,10 +1,10 @@
 import numpy as np
 import scipy.spatial.transform
 
+from assets.make.local_transforms import local_transforms
+from soma_core.geometry.tree import depth_order
 from soma_core.rig.transforms import (
-    depth_order,
     fused_product,
-    local_transforms,
     project_rotations,
     world_transforms,
 )

@@ -11,7 +11,7 @@ import torch
 
 from soma_core import SomaLayer, load_canonical
 from soma_core.geometry.barycentric import closest_point_on_triangle
-from soma_core.testing.synthetic import write_obj
+from soma_core.obj import write_obj
 from soma_core.topology.closest import ClosestFaces
 
 __all__ = ["Body", "make_body", "surface_wrap", "write_wrap"]

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from soma_core.testing.synthetic import write_obj
+from soma_core.obj import write_obj
 from tests.standins.body import make_body, write_wrap
 
 __all__ = ["COMPONENTS", "FACES", "VERTICES", "garment_arrays", "write_garment_pair", "write_pca"]

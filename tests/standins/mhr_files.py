@@ -11,7 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from soma_core import load_canonical
-from soma_core.testing.synthetic import write_obj
+from soma_core.obj import write_obj
 from tests.standins.body import Body, make_body, write_wrap
 
 __all__ = ["LODS", "StandIn", "mhr_body", "write_mhr_pair", "write_model"]

@@ -1,4 +1,3 @@
-import importlib.util
 import shutil
 from dataclasses import replace
 
@@ -7,7 +6,6 @@ import pytest
 
 from soma_core.cache import file_sha256
 from soma_core.errors import AssetError
-from soma_core.io import read_motion
 from soma_core.paths import assets_dir
 from soma_core.rig.manifest import (
     NEUTRAL_NAME,
@@ -16,8 +14,7 @@ from soma_core.rig.manifest import (
     read_manifest,
     write_manifest,
 )
-from soma_core.tasks import assets
-from soma_core.tasks.assets import build_assets, verify_assets
+from soma_core.tasks.assets import verify_assets
 
 _NEEDED = (RIG_NAME, NEUTRAL_NAME, PROCEDURAL_NAME)
 
@@ -80,21 +77,3 @@ def test_an_incomplete_manifest_is_found(copied):
     write_manifest(copied, replace(manifest, files=files))
     with pytest.raises(AssetError, match=r"does not list SOMA_template_rig\.usda"):
         verify_assets(copied)
-
-
-@pytest.mark.skipif(importlib.util.find_spec("anny") is None, reason="anny is not installed")
-def test_a_folder_built_anew_is_complete_and_says_what_it_lacks(tmp_path, caplog):
-    build_assets(tmp_path)
-    assert set(verify_assets(tmp_path)) == set(verify_assets())
-    clip = "motions/range_of_motion.npz"
-    assert (tmp_path / clip).read_bytes() == (assets_dir() / clip).read_bytes()
-    assert "SOMA_neutral.npz holds no shape components" in caplog.text
-    assert "soma assets build --shape-space FILE" in caplog.text
-
-
-def test_without_a_shipped_clip_it_is_made_for_the_rig_in_the_folder(copied, tmp_path, monkeypatch):
-    monkeypatch.setattr(assets, "assets_dir", lambda: tmp_path / "none")
-    assets._add_clip(copied)
-    made, shipped = (read_motion(root / "motions/range_of_motion.npz") for root in (copied, assets_dir()))
-    np.testing.assert_allclose(made.translation, shipped.translation, atol=1e-6)  # float32 in the file
-    assert made.rig_revision == read_manifest(copied).rig_revision

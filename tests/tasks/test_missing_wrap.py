@@ -13,6 +13,7 @@ import torch
 import soma_core.cli
 from soma_core.errors import InputError
 from soma_core.native import NativeTransfer
+from soma_core.obj import read_obj
 from soma_core.plugin.errors import BackendError
 from soma_core.plugin.hookspecs import hookimpl
 from soma_core.plugin.registry import Registry
@@ -22,7 +23,6 @@ from soma_core.registration.target import Frame, Skin
 from soma_core.rig import load_canonical
 from soma_core.tasks import missing_wrap
 from soma_core.tasks.wrap import WRAP_FILE
-from soma_core.topology.wrap_pair import read_obj
 from tests.plugin.fakes import FakeEntryPoint, declares
 
 KIND = {"device": torch.device("cpu"), "dtype": torch.float32}

@@ -13,6 +13,7 @@ from omegaconf import DictConfig, OmegaConf
 from soma_core.cli import EXIT_USAGE, main
 from soma_core.config.schema import WrapConfig
 from soma_core.errors import AssetError, InputError
+from soma_core.obj import read_obj
 from soma_core.plugin.hookspecs import hookimpl
 from soma_core.plugin.registry import Registry
 from soma_core.plugin.spec import Parameter, WrapPair
@@ -22,7 +23,6 @@ from soma_core.rig import load_canonical
 from soma_core.rig.mesh import CanonicalMesh
 from soma_core.tasks import wrap
 from soma_core.topology.correspondence import load_correspondence
-from soma_core.topology.wrap_pair import read_obj
 from tests.plugin.fakes import FakeEntryPoint, declares
 
 ROUNDING_MM = 1e-3  # seven decimals of a metre

@@ -13,9 +13,9 @@ import yaml
 
 from soma_core import SomaLayer, load_canonical
 from soma_core.errors import InputError
+from soma_core.obj import read_obj
 from soma_core.plugin.registry import Registry
 from soma_core.template import distribution, write_backend
-from soma_core.topology.wrap_pair import read_obj
 from tests.plugin.fakes import FakeDistribution, FakeEntryPoint, good
 
 FILE_PRECISION = 1e-6

@@ -14,12 +14,12 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from soma_core.geometry.barycentric import closest_point_on_triangle
+from soma_core.obj import read_obj, write_obj
 from soma_core.plugin.registry import Registry
 from soma_core.testing.report import Report
 from soma_core.testing.run import check_backend
-from soma_core.testing.synthetic import synthetic_canonical, write_obj, write_wrap_pair
+from soma_core.testing.synthetic import synthetic_canonical, write_wrap_pair
 from soma_core.topology.closest import ClosestFaces
-from soma_core.topology.wrap_pair import read_obj
 from tests.plugin.fakes import FakeEntryPoint
 
 __all__ = ["PACKAGE", "Edit", "Package", "check_package", "package"]

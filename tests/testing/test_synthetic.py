@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from soma_core.io import USER_JOINTS
+from soma_core.obj import read_obj
 from soma_core.rig import load_canonical
 from soma_core.testing.synthetic import (
     NATIVE_FROM_CANONICAL,
@@ -14,7 +15,6 @@ from soma_core.testing.synthetic import (
     write_wrap_pair,
 )
 from soma_core.topology.correspondence import load_correspondence
-from soma_core.topology.wrap_pair import read_obj
 
 MESH, RIG = synthetic_canonical()
 ROUNDING = 1e-12

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from soma_core.errors import AssetError, InputError
-from soma_core.topology.wrap_pair import check_wrap, read_obj
+from soma_core.obj import read_obj
+from soma_core.topology.wrap_pair import check_wrap
 from tests.bodies import native_body, tiny_canonical, wrap_vertices, write_obj
 
 MESH, _ = tiny_canonical()
@@ -156,3 +157,8 @@ def test_faces_of_another_mesh():
 def test_written_objs_are_exact(tmp_path):
     path = write_obj(tmp_path / "a.obj", wrap_vertices(), MESH.triangles)
     np.testing.assert_array_equal(read_obj(path)[0], wrap_vertices())
+
+
+def test_an_obj_is_written_to_so_many_digits(tmp_path):
+    path = write_obj(tmp_path / "a.obj", np.array([[1 / 3, -2.0, 1e-9]] * 3), np.array([[0, 1, 2]]), digits=3)
+    assert path.read_text().splitlines() == ["v 0.333 -2.000 0.000"] * 3 + ["f 1 2 3"]

@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
+from soma_core.obj import read_obj, write_obj
 from soma_core.plugin.spec import BackendSpec, WrapPair
-from soma_core.testing.synthetic import synthetic_canonical, synthetic_native, write_obj, write_wrap_pair
+from soma_core.testing.synthetic import synthetic_canonical, synthetic_native, write_wrap_pair
 from soma_core.topology.correspondence import load_correspondence
-from soma_core.topology.wrap_pair import read_obj
 from soma_core.topology.wrap_statistics import wrap_statistics
 
 MESH = synthetic_canonical()[0]

@@ -11,8 +11,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from soma_backend_anny._source import data_dir, local_change_names
-from soma_core.plugin.hookspecs import hookimpl
-from soma_core.plugin.spec import BackendSpec, Generator, Parameter, WrapPair
+from soma_core.plugin import BackendSpec, Generator, Parameter, WrapPair, hookimpl
 
 if TYPE_CHECKING:
     import torch

@@ -16,8 +16,8 @@ import numpy as np
 import torch
 
 from soma_backend_anny import _makehuman, _phenotypes, _source
-from soma_core.cache import cached_arrays, content_key, file_sha256
-from soma_core.errors import AssetError
+from soma_core import AssetError
+from soma_core.plugin import cached_arrays, content_key, file_sha256
 
 __all__ = ["DEFAULT_PHENOTYPES", "PHENOTYPES", "CompactBasis", "load_local_changes", "load_phenotype_basis"]
 

@@ -11,8 +11,8 @@ from torch import Tensor
 
 from soma_backend_anny import _basis
 from soma_backend_anny._phenotypes import macro_weights
-from soma_core.errors import InputError
-from soma_core.plugin.spec import BackendSpec, LinearBasis
+from soma_core import InputError
+from soma_core.plugin import BackendSpec, LinearBasis
 
 __all__ = ["AnnyGenerator", "signed_parts"]
 

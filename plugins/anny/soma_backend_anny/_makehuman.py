@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from soma_core.errors import AssetError
+from soma_core import AssetError
 
 __all__ = ["base_mesh", "local_targets", "target"]
 

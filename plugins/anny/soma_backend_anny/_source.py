@@ -6,7 +6,7 @@ import importlib.metadata
 import importlib.util
 from pathlib import Path
 
-from soma_core.errors import AssetError
+from soma_core import AssetError
 
 __all__ = ["FIX", "data_dir", "local_change_names", "version"]
 

@@ -14,7 +14,7 @@ from soma_backend_anny import _makehuman, _source
 from soma_backend_anny._basis import PHENOTYPES, load_local_changes
 from soma_backend_anny._generator import signed_parts
 
-from soma_core.errors import AssetError, InputError
+from soma_core import AssetError, InputError
 
 ALIGNMENT_M = 1e-6
 """The OBJ stores micrometres and the basis float32 offsets."""

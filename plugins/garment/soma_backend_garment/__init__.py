@@ -11,11 +11,17 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from soma_core.cache import atomic_write
-from soma_core.errors import InputError
-from soma_core.paths import data_dir
-from soma_core.plugin.hookspecs import hookimpl
-from soma_core.plugin.spec import BackendSpec, FileNeeded, Generator, Parameter, WrapPair
+from soma_core import InputError
+from soma_core.plugin import (
+    BackendSpec,
+    FileNeeded,
+    Generator,
+    Parameter,
+    WrapPair,
+    atomic_write,
+    data_dir,
+    hookimpl,
+)
 
 if TYPE_CHECKING:
     import torch
@@ -88,5 +94,5 @@ def soma_convert(source: Path, output: Path | None) -> Sequence[Path]:
     write_npz(target, read_pca(source), source=source)
     if native.exists() or not mean.is_file():
         return [target]
-    atomic_write(native, lambda temporary: shutil.copyfile(mean, temporary) and None)
+    atomic_write(native, lambda temporary: shutil.copyfile(mean, temporary))
     return [target, native]

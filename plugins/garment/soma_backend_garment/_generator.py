@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from soma_backend_garment._point_pca import PointSpace
-from soma_core.plugin.spec import LinearBasis
+from soma_core.plugin import LinearBasis
 
 __all__ = ["GarmentGenerator"]
 

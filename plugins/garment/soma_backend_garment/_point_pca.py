@@ -13,10 +13,8 @@ from pathlib import Path
 
 import numpy as np
 
-from soma_core.cache import atomic_write, file_sha256
-from soma_core.errors import AssetError
-from soma_core.files import refuse_unreadable
-from soma_core.npz import open_npz_file
+from soma_core import AssetError
+from soma_core.plugin import atomic_arrays, file_sha256, open_npz_file, refuse_unreadable
 
 __all__ = ["COMPONENTS", "VERTICES", "PointSpace", "read_npz", "read_pca", "write_npz"]
 
@@ -126,9 +124,4 @@ def write_npz(path: Path, space: PointSpace, *, source: Path) -> None:
         "pca_matrix": space.matrix, "pca_mean": space.mean, "eigenvalues": space.eigenvalues,
         "meta": np.array(json.dumps(meta, sort_keys=True)),
     }  # fmt: skip
-
-    def write(temporary: Path) -> None:
-        with open(temporary, "wb") as stream:
-            np.savez(stream, **arrays)
-
-    atomic_write(path, write)
+    atomic_arrays(path, arrays, compressed=False)

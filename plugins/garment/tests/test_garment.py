@@ -11,9 +11,8 @@ import torch
 from soma_backend_garment._generator import GarmentGenerator
 from soma_backend_garment._point_pca import PointSpace, read_npz, read_pca
 
-from soma_core.errors import AssetError, InputError
-from soma_core.plugin.errors import BrokenBackendError
-from soma_core.plugin.registry import Registry
+from soma_core import AssetError, InputError
+from soma_core.plugin import BrokenBackendError, Registry
 from soma_core.testing import check_backend
 from tests.standins.garment_files import COMPONENTS, VERTICES, garment_arrays, write_garment_pair, write_pca
 

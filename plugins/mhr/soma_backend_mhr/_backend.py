@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from soma_backend_mhr._files import IDENTITY, Lod
-from soma_core.plugin.spec import BackendSpec, FileNeeded, Generator, Parameter
+from soma_core.plugin import BackendSpec, FileNeeded, Generator, Parameter
 
 if TYPE_CHECKING:
     import torch

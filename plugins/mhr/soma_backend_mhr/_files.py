@@ -5,8 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from soma_core.paths import data_dir
-from soma_core.plugin.spec import WrapPair
+from soma_core.plugin import WrapPair, data_dir
 
 __all__ = ["EXPRESSIONS", "IDENTITY", "JOINTS", "LOD1", "LOD6", "PARAMETERS", "VERTEX_COUNTS", "Lod"]
 

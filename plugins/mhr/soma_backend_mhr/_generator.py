@@ -9,7 +9,7 @@ from torch import Tensor
 
 from soma_backend_mhr._files import EXPRESSIONS
 from soma_backend_mhr._model_file import Model
-from soma_core.errors import InputError
+from soma_core import InputError
 
 __all__ = ["BONE_LENGTHS", "POSE", "SCALES", "MhrGenerator"]
 

@@ -13,9 +13,8 @@ import torch
 from torch import Tensor
 
 from soma_backend_mhr._files import EXPRESSIONS, IDENTITY, JOINTS, LOD1, LOD6, PARAMETERS, VERTEX_COUNTS, Lod
-from soma_core.cache import file_sha256
-from soma_core.errors import AssetError
-from soma_core.files import refuse_unreadable
+from soma_core import AssetError
+from soma_core.plugin import file_sha256, refuse_unreadable
 
 __all__ = ["Model", "load_model"]
 

@@ -7,8 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from soma_backend_mhr._backend import build, declare
 from soma_backend_mhr._files import LOD6
-from soma_core.plugin.hookspecs import hookimpl
-from soma_core.plugin.spec import BackendSpec, Generator
+from soma_core.plugin import BackendSpec, Generator, hookimpl
 
 if TYPE_CHECKING:
     import torch

@@ -7,11 +7,9 @@ import pytest
 import torch
 from omegaconf import OmegaConf
 
+from soma_core import AssetError, BackendError, InputError, read_motion
 from soma_core.config.schema import ConvertConfig, IdentityMethod
-from soma_core.errors import AssetError, InputError
-from soma_core.io import read_motion
-from soma_core.plugin.errors import BackendError
-from soma_core.plugin.registry import Registry
+from soma_core.plugin import Registry
 from soma_core.tasks.convert_file import Converter
 from soma_core.tasks.fit_job import ResultFiles
 from tests.standins.mhr_files import StandIn, mhr_body

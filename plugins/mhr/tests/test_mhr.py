@@ -8,9 +8,8 @@ import pytest
 import torch
 from soma_backend_mhr._files import LOD1, LOD6
 
-from soma_core.errors import InputError
-from soma_core.plugin.errors import BrokenBackendError
-from soma_core.plugin.registry import Registry
+from soma_core import InputError
+from soma_core.plugin import BrokenBackendError, Registry
 from soma_core.testing import check_backend
 
 CPU = torch.device("cpu")

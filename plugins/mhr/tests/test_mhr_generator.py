@@ -8,7 +8,7 @@ from soma_backend_mhr._files import LOD6
 from soma_backend_mhr._generator import POSE, MhrGenerator
 from soma_backend_mhr._model_file import load_model
 
-from soma_core.errors import InputError
+from soma_core import InputError
 from tests.standins.mhr_files import StandIn, mhr_body
 
 ROUNDING = 1e-9

@@ -14,8 +14,8 @@ from soma_backend_mhr._files import LOD1, LOD6
 from soma_backend_mhr._model_file import load_model
 from torch import Tensor, nn
 
-from soma_core.cache import file_sha256
-from soma_core.errors import AssetError
+from soma_core import AssetError
+from soma_core.plugin import file_sha256
 from tests.real_mhr import NEUTRAL, needs_mhr
 from tests.standins.mhr_files import mhr_body, write_model
 

@@ -11,11 +11,19 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 from soma_backend_smpl._files import SUFFIXES, canonical_path, find_models, gender_of, wrap_paths
-from soma_backend_smpl._model_file import ModelFile, read_model, shape_width
+from soma_backend_smpl._model_file import read_model, shape_width
 from soma_backend_smpl.family import FAMILIES, Family
-from soma_core.cache import atomic_write, file_sha256
-from soma_core.errors import AssetError, InputError
-from soma_core.plugin.spec import BackendSpec, FileNeeded, Generator, Parameter, WrapPair
+from soma_core import AssetError, InputError
+from soma_core.plugin import (
+    BackendSpec,
+    FileNeeded,
+    Generator,
+    Parameter,
+    WrapPair,
+    atomic_arrays,
+    file_sha256,
+    write_obj,
+)
 
 if TYPE_CHECKING:
     import torch
@@ -155,21 +163,9 @@ def convert(family: Family, source: Path, output: Path | None) -> list[Path]:
         "unit": "m", "up_axis": "+y", "forward_axis": "+z", "licence": LICENCE, "url": family.url,
     }  # fmt: skip
     arrays = model.arrays() | {"meta": np.array(json.dumps(meta, sort_keys=True))}
-    atomic_write(target, lambda temporary: _save(temporary, arrays))
+    atomic_arrays(target, arrays, compressed=False)
     native, _ = wrap_paths(family)
     if native.exists():
         return [target]
-    atomic_write(native, lambda temporary: _write_obj(temporary, model))
+    write_obj(native, model.template.astype(np.float32), model.faces)  # the precision of the converted model
     return [target, native]
-
-
-def _save(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
-    with open(path, "wb") as stream:
-        np.savez(stream, **arrays)
-
-
-def _write_obj(path: Path, model: ModelFile) -> None:
-    template = model.template.astype(np.float32).tolist()  # the precision of the converted model
-    lines = [f"v {x!r} {y!r} {z!r}" for x, y, z in template]
-    lines += [f"f {a} {b} {c}" for a, b, c in (model.faces + 1).tolist()]
-    path.write_text("\n".join(lines) + "\n", encoding="ascii")

@@ -6,7 +6,7 @@ import re
 from pathlib import Path
 
 from soma_backend_smpl.family import GENDERS, Family
-from soma_core.paths import data_dir
+from soma_core.plugin import data_dir
 
 __all__ = ["SUFFIXES", "canonical_path", "find_models", "gender_of", "wrap_paths"]
 

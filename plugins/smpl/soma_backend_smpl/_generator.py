@@ -10,9 +10,8 @@ import torch
 from torch import Tensor
 
 from soma_backend_smpl._model_file import ModelFile
-from soma_core.errors import InputError
-from soma_core.geometry.rotations import axis_angle_to_matrix
-from soma_core.plugin.spec import LinearBasis, SkinnedModel
+from soma_core import InputError
+from soma_core.plugin import LinearBasis, SkinnedModel, axis_angle_to_matrix
 
 __all__ = ["SmplGenerator"]
 

@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 
 from soma_backend_smpl.family import FAMILIES, Family
-from soma_core.errors import AssetError
-from soma_core.npz import open_npz_file
+from soma_core import AssetError
+from soma_core.plugin import open_npz_file
 
 __all__ = ["KEYS", "ModelFile", "read_model", "shape_width"]
 
@@ -119,7 +119,7 @@ def _refused(path: Path, family: Family, cause: str) -> AssetError:
 
 def _read(path: Path, keys: tuple[str, ...]) -> dict[str, np.ndarray]:
     if path.suffix.lower() == ".pkl":
-        from soma_core.io.pickled_arrays import read_pickled_arrays
+        from soma_core.plugin import read_pickled_arrays
 
         return read_pickled_arrays(path, keys)
     with open_npz_file(path, fix="Convert the official file with `soma backends convert`.") as file:

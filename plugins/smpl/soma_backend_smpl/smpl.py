@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from soma_backend_smpl._backend import build, convert, declare
 from soma_backend_smpl.family import SMPL
-from soma_core.plugin.hookspecs import hookimpl
-from soma_core.plugin.spec import BackendSpec, Generator
+from soma_core.plugin import BackendSpec, Generator, hookimpl
 
 if TYPE_CHECKING:
     import torch

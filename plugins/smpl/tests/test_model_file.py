@@ -12,7 +12,7 @@ from soma_backend_smpl._files import find_models
 from soma_backend_smpl._model_file import read_model, shape_width
 from soma_backend_smpl.family import SMPL, SMPLH, SMPLX
 
-from soma_core.errors import AssetError, InputError
+from soma_core import AssetError, InputError
 from tests.standins.pickles import ch
 from tests.standins.smpl_files import FAMILIES, smpl_arrays, smpl_model, write_npz, write_smpl_pickle
 

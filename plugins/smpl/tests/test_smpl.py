@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from soma_core.plugin.registry import Registry
+from soma_core.plugin import Registry
 from soma_core.testing import check_backend
 
 

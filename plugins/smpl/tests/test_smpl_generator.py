@@ -10,8 +10,8 @@ from soma_backend_smpl import smpl
 from soma_backend_smpl._generator import SmplGenerator
 from soma_backend_smpl._model_file import read_model
 
-from soma_core.errors import AssetError, InputError
-from soma_core.plugin.registry import Registry
+from soma_core import AssetError, InputError
+from soma_core.plugin import Registry
 from tests.standins.smpl_files import FAMILIES, smpl_arrays, write_npz
 
 ROUNDING = 1e-10

@@ -10,7 +10,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from soma_core import BackendSpec, Generator, Parameter, WrapPair, hookimpl
+from soma_core.plugin import BackendSpec, Generator, Parameter, WrapPair, hookimpl
 
 if TYPE_CHECKING:
     import torch

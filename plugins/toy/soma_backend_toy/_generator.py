@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from soma_backend_toy._figure import figure
-from soma_core import LinearBasis
+from soma_core.plugin import LinearBasis
 
 __all__ = ["ToyGenerator"]
 

@@ -13,7 +13,7 @@ from soma_backend_toy._figure import SEGMENTS, figure, figure_triangles
 from soma_backend_toy._generator import ToyGenerator
 
 from soma_core import SomaLayer, load_canonical
-from soma_core.topology.wrap_pair import read_obj
+from soma_core.plugin import read_obj
 
 FILE_PRECISION = 0.6e-3
 """Centimetres: the files keep three decimals."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from soma_core.plugin.checks import Check
 from soma_core.testing.checks import (
     agreement,
     behaviour,
@@ -14,7 +15,6 @@ from soma_core.testing.checks import (
     transfer,
     wrap,
 )
-from soma_core.testing.conformance import Check
 
 __all__ = ["CORE_CHECKS"]
 

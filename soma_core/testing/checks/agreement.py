@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import torch
 
+from soma_core.plugin.checks import CheckFailedError, check
 from soma_core.plugin.spec import HasLinearBasis
-from soma_core.testing.conformance import CheckFailedError, check
 from soma_core.testing.context import Context
 
 __all__ = ["CHECKS"]

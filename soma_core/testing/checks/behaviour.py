@@ -7,8 +7,8 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
+from soma_core.plugin.checks import CheckFailedError, check
 from soma_core.plugin.spec import Generator
-from soma_core.testing.conformance import CheckFailedError, check
 from soma_core.testing.context import Context
 from soma_core.testing.global_state import changes, snapshot
 

@@ -6,8 +6,8 @@ import itertools
 
 import numpy as np
 
+from soma_core.plugin.checks import CheckFailedError, check
 from soma_core.plugin.spec import Axis
-from soma_core.testing.conformance import CheckFailedError, check
 from soma_core.testing.context import Context
 
 __all__ = ["CHECKS"]

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+from soma_core.plugin.checks import CheckFailedError, check
 from soma_core.plugin.options import checked_options
-from soma_core.testing.conformance import CheckFailedError, check
 from soma_core.testing.context import Context
 from soma_core.topology.transfer import filled_vertices
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import torch
 
-from soma_core.testing.conformance import CheckFailedError, check
+from soma_core.plugin.checks import CheckFailedError, check
 from soma_core.testing.context import CPU, Context
 from soma_core.testing.samples import at_range_ends
 

@@ -10,9 +10,9 @@ from omegaconf import DictConfig, OmegaConf
 
 from soma_core.config.schema import register_schemas
 from soma_core.paths import configs_dir
+from soma_core.plugin.checks import CheckFailedError, check
 from soma_core.plugin.discovery import CORE_PACKAGE
 from soma_core.plugin.options import checked_options
-from soma_core.testing.conformance import CheckFailedError, check
 from soma_core.testing.context import Context
 
 __all__ = ["CHECKS"]

@@ -8,7 +8,7 @@ from typing import TypeAlias
 import torch
 from torch import Tensor
 
-from soma_core.testing.conformance import CheckFailedError, check
+from soma_core.plugin.checks import CheckFailedError, check
 from soma_core.testing.context import Context
 from soma_core.testing.samples import Change, changed_rows, entry_changes, near_defaults
 

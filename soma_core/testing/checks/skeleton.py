@@ -8,8 +8,8 @@ from torch import Tensor
 
 from soma_core.geometry.rotations import axis_angle_to_matrix, matrix_to_axis_angle, orthonormality_error
 from soma_core.inversion import PoseInversion
+from soma_core.plugin.checks import CheckFailedError, check
 from soma_core.skeleton.identity import Identity
-from soma_core.testing.conformance import CheckFailedError, check
 from soma_core.testing.context import Context
 from soma_core.testing.samples import at_range_ends, changed_rows
 

@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 import copy
+from typing import Any
 
 import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
 
 from soma_core.geometry.barycentric import closest_point_on_triangle
-from soma_core.testing.conformance import CheckFailedError, check
+from soma_core.plugin.checks import CheckFailedError, check
 from soma_core.testing.context import Context
 from soma_core.topology.closest import ClosestFaces
-from soma_core.topology.wrap_pair import canonical_edges
 
 __all__ = ["CHECKS"]
 
@@ -81,7 +81,7 @@ def _refuse_uncovered(context: Context, native: np.ndarray, body: np.ndarray) ->
 @check("transfer-random", level="core", needs=("stature",))
 def transfer_random(context: Context) -> None:
     """Random bodies keep the neighbourhoods of the default body."""
-    start, end = canonical_edges(context.mesh)
+    start, end = context.mesh.edges().T
     bodies = context.bodies.identity.fitted_rest.numpy()
     length = np.linalg.norm(bodies[:, start] - bodies[:, end], axis=-1)
     length /= np.median(length, axis=1, keepdims=True)
@@ -100,7 +100,7 @@ def transfer_random(context: Context) -> None:
 @check("similarity-equivariant", needs=("transfer-neutral", "transfer-random"))
 def similarity_equivariant(context: Context) -> None:
     """Turning, scaling and moving the native body does the same to the canonical one."""
-    transfer = copy.deepcopy(context.layer.rest_shape.transfer).float()
+    transfer: Any = copy.deepcopy(context.layer.rest_shape.transfer).float()
     frame = context.native_frame
     turn = torch.as_tensor(Rotation.from_rotvec([0.9, -0.5, 0.7]).as_matrix())
     native_turn = torch.as_tensor(np.linalg.inv(frame)) @ turn @ torch.as_tensor(frame)

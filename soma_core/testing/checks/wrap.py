@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from soma_core.testing.conformance import CheckFailedError, check
+from soma_core.plugin.checks import CheckFailedError, check
 from soma_core.testing.context import Context
-from soma_core.topology.wrap_pair import canonical_edges, check_count, check_faces, check_order
+from soma_core.topology.wrap_pair import check_count, check_faces, check_order
 
 __all__ = ["CHECKS"]
 
@@ -42,7 +42,7 @@ def wrap_count(context: Context) -> None:
 def wrap_order(context: Context) -> None:
     """The wrap's vertices are in canonical order."""
     check_order(context.wrap.vertices, context.mesh, path=context.wrap.path)
-    edges = canonical_edges(context.mesh)
+    edges = context.mesh.edges()
     limit = _STRAY_RATIO * _relative_reach(context.mesh.vertices, edges).max()
     reach = _relative_reach(context.wrap.vertices, edges)
     worst = int(reach.argmax())
@@ -55,9 +55,9 @@ def wrap_order(context: Context) -> None:
         )
 
 
-def _relative_reach(points: np.ndarray, edges: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
+def _relative_reach(points: np.ndarray, edges: np.ndarray) -> np.ndarray:
     """Mean distance of each vertex to its neighbours, relative to the body's diagonal, (v,)."""
-    start, end = edges
+    start, end = edges.T
     length = np.linalg.norm(points[start] - points[end], axis=1) / np.linalg.norm(np.ptp(points, axis=0))
     both = np.concatenate((start, end))
     return np.bincount(both, np.tile(length, 2), len(points)) / np.bincount(both, minlength=len(points))

@@ -5,8 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from soma_core import BackendSpec, Parameter, WrapPair, hookimpl
-from soma_core.plugin.spec import FileNeeded
+from soma_core.plugin import BackendSpec, FileNeeded, Parameter, WrapPair, hookimpl
 
 FOLDER = Path(__file__).parent
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import torch
 
-from soma_core.testing import CheckFailedError, check
+from soma_core.plugin import CheckFailedError, check
 
 
 @check("taller", level="core", needs=("finite",))

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import torch
 
-from soma_core import LinearBasis
-from soma_core.topology.wrap_pair import read_obj
+from soma_core.plugin import LinearBasis, read_obj
 
 
 class Specimen:

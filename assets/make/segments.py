@@ -14,6 +14,7 @@ import scipy.sparse
 from scipy.sparse.csgraph import connected_components
 
 from soma_core.errors import InputError
+from soma_core.geometry.mesh import triangle_sides
 
 __all__ = ["RiggedMesh", "label_segments"]
 
@@ -68,7 +69,7 @@ class RiggedMesh:
 
     def adjacency(self) -> scipy.sparse.csr_array:
         """Which vertices share an edge: (v, v), entries 1."""
-        pairs = np.concatenate([self.triangles[:, [i, (i + 1) % 3]] for i in range(3)])
+        pairs = triangle_sides(self.triangles)
         count = len(self.vertices)
         # Every edge of a closed, oriented mesh appears once in each direction.
         return scipy.sparse.csr_array((np.ones(len(pairs)), tuple(pairs.T)), shape=(count, count))

@@ -12,10 +12,21 @@ from typing import Any
 import numpy as np
 import scipy.sparse
 
-from soma_core.cache import atomic_write, file_sha256
+from assets.make.local_transforms import local_transforms
+from assets.make.neutral import compress_shape_space, write_neutral
+from assets.make.segments import RiggedMesh, label_segments
+from assets.make.source import SOURCE_SHA256, SourceRig, read_source
+from assets.make.subdivision import LowMesh, recover_low
+from assets.make.symmetry import mirror_vertices
+from assets.make.twist_template import procedural_document
+from assets.make.twist_weights import spread_weights
+from assets.make.usd_text import SkinMeshText, rig_text
+from assets.make.xlo import LowSkin, XloSkin, make_xlo
+from soma_core.cache import atomic_text, file_sha256
 from soma_core.errors import AssetError
-from soma_core.rig.compression import compress_shape_space
+from soma_core.geometry.mesh import split_polygons
 from soma_core.rig.expansion import helper_transforms
+from soma_core.rig.influences import padded_influences
 from soma_core.rig.manifest import (
     CORRECTIVES_NAME,
     NEUTRAL_NAME,
@@ -24,21 +35,13 @@ from soma_core.rig.manifest import (
     Manifest,
     write_manifest,
 )
-from soma_core.rig.neutral import SEGMENT_NAMES, ShapeSpace, load_shape_space, write_neutral
+from soma_core.rig.neutral import SEGMENT_NAMES, ShapeSpace, load_shape_space
 from soma_core.rig.procedural import ProceduralDefinition
 from soma_core.rig.procedural_json import parse_procedural
 from soma_core.rig.revision import REVISION_DIGITS, rig_hash
-from soma_core.rig.segments import RiggedMesh, label_segments
-from soma_core.rig.source import SOURCE_SHA256, SourceRig, read_source
-from soma_core.rig.subdivision import LowMesh, recover_low, split_polygons
-from soma_core.rig.symmetry import mirror_vertices
-from soma_core.rig.transforms import local_transforms, world_transforms
-from soma_core.rig.twist_template import procedural_document
-from soma_core.rig.twist_weights import spread_weights
-from soma_core.rig.usd_text import SkinMeshText, rig_text
-from soma_core.rig.xlo import LowSkin, XloSkin, make_xlo
+from soma_core.rig.transforms import world_transforms
 
-__all__ = ["build_assets"]
+__all__ = ["build_rig"]
 
 _log = logging.getLogger(__name__)
 
@@ -145,15 +148,6 @@ def _low_skin(source: SourceRig, low: LowMesh, mirror: np.ndarray) -> LowSkin:
     )
 
 
-def _influences(weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Every non-zero influence as (v, k) joints and weights, strongest first, padded with zeros."""
-    width = int((weights != 0).sum(axis=1).max())
-    joints = np.argsort(-weights, axis=1, kind="stable")[:, :width].astype(np.int32)
-    values = np.take_along_axis(weights, joints, axis=1).astype(np.float32)
-    joints[values == 0] = 0
-    return joints, values
-
-
 def _skin(built: _Built, lod: str) -> SkinMeshText:
     """One LOD of the skin; the low one takes its points, weights and UVs from the mid one."""
     source, topology = built.source, built.topology
@@ -161,7 +155,7 @@ def _skin(built: _Built, lod: str) -> SkinMeshText:
     uv, uv_indices = source.uv, source.uv_quads.reshape(-1)
     if lod == "low":
         uv, uv_indices = _low_texture(source, built.low)
-    joints, weights = _influences(built.weights)
+    joints, weights = padded_influences(scipy.sparse.csr_array(built.weights))
     return SkinMeshText(
         name="c_skin_mid" if lod == "mid" else "c_skin_lo",
         points=source.bind_shape[:count].astype(np.float32),
@@ -169,8 +163,8 @@ def _skin(built: _Built, lod: str) -> SkinMeshText:
         face_vert_counts=topology["face_vert_counts" + suffix],
         uv=uv,
         uv_indices=uv_indices,
-        joint_indices=joints[:count],
-        joint_weights=weights[:count],
+        joint_indices=joints[:count].astype(np.int32),
+        joint_weights=weights[:count].astype(np.float32),
     )
 
 
@@ -178,7 +172,7 @@ def _xlo_skin(built: _Built) -> SkinMeshText:
     """The extra-low skin, its weights spread over the helpers by its own points."""
     xlo, places = built.xlo, built.source.bind_world[:, :3, 3]
     public = scipy.sparse.csr_array(xlo.weights.astype(np.float32), dtype=np.float64)
-    joints, weights = _influences(spread_weights(public, xlo.points, places, built.definition).toarray())
+    joints, weights = padded_influences(spread_weights(public, xlo.points, places, built.definition))
     return SkinMeshText(
         name="c_skin_xlo",
         points=xlo.points,
@@ -186,8 +180,8 @@ def _xlo_skin(built: _Built) -> SkinMeshText:
         face_vert_counts=np.full(len(xlo.triangles), 3, np.int32),
         uv=xlo.uv,
         uv_indices=xlo.uv_indices,
-        joint_indices=joints,
-        joint_weights=weights,
+        joint_indices=joints.astype(np.int32),
+        joint_weights=weights.astype(np.float32),
     )
 
 
@@ -206,6 +200,7 @@ def _usda(built: _Built) -> str:
         rest_local=local_transforms(rest, parents),
         meshes=[_skin(built, "mid"), _skin(built, "low"), _xlo_skin(built)],
         notes={"licence": _LICENCE, "origin": _ORIGIN, "rig_hash": built.rig_hash},
+        # Part of the shipped bytes, as it was first written.
         comment="Canonical SOMA rig with its twist joints; restTransforms hold the T-pose. "
         "Written by soma assets build.",
     )
@@ -285,7 +280,7 @@ def _found_entries(output: Path, built: _Built) -> dict[str, dict[str, Any]]:
     return entries
 
 
-def build_assets(output: Path, shape_space: Path | None = None) -> Manifest:
+def build_rig(output: Path, shape_space: Path | None = None) -> Manifest:
     """Write the rig, the neutral asset and the manifest into `output`; the same input, the same bytes.
 
     Args:
@@ -299,9 +294,9 @@ def build_assets(output: Path, shape_space: Path | None = None) -> Manifest:
     built = _derive(read_source())
     space = _shape_space(built, output, shape_space)
     text = _usda(built)
-    atomic_write(output / RIG_NAME, lambda temporary: temporary.write_text(text, encoding="utf-8"))
+    atomic_text(output / RIG_NAME, text)
     definition = json.dumps(procedural_document(built.source.joint_names), indent=1) + "\n"
-    atomic_write(output / PROCEDURAL_NAME, lambda temporary: temporary.write_text(definition, "utf-8"))
+    atomic_text(output / PROCEDURAL_NAME, definition)
     write_neutral(output / NEUTRAL_NAME, built.topology, space, _metadata(built))
     counts = {
         "joints": len(built.source.joint_names),

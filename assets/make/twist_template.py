@@ -1,4 +1,4 @@
-"""The twist segments of the shipped rig, as the document that ``soma assets build`` writes."""
+"""The twist segments of the shipped rig, as the document that ``python -m assets.make`` writes."""
 
 from __future__ import annotations
 

@@ -1,8 +1,8 @@
 import numpy as np
 import pytest
 
+from assets.make.subdivision import recover_low
 from soma_core.errors import InputError
-from soma_core.rig.subdivision import recover_low, split_polygons
 
 
 def subdivided() -> np.ndarray:
@@ -43,14 +43,3 @@ def test_scrambled_corners_are_refused():
     quads[0, [0, 2]] = quads[0, [2, 0]]
     with pytest.raises(InputError, match=f"face point {quads[0, 3]}"):
         recover_low(quads)
-
-
-@pytest.mark.parametrize(("stretch", "diagonal"), [(0.5, {0, 2}), (2.0, {1, 3})])
-def test_quads_split_along_the_shorter_diagonal(stretch, diagonal):
-    kite = np.array([[-1.0, 0, 0], [0, -1, 0], [1, 0, 0], [0, 1, 0]]) * [stretch, 1, 1]
-    triangles = split_polygons(np.arange(4), np.array([4]), kite)
-    assert set(triangles[0]) & set(triangles[1]) == diagonal
-    normals = np.cross(
-        kite[triangles[:, 1]] - kite[triangles[:, 0]], kite[triangles[:, 2]] - kite[triangles[:, 0]]
-    )
-    assert (normals[:, 2] > 0).all()

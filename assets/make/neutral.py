@@ -1,14 +1,20 @@
-"""Round a shape space so that it deflates well, and say what that costs."""
+"""Write ``SOMA_neutral.npz``; round a shape space so that it deflates well, and say what that costs."""
 
 from __future__ import annotations
 
+import json
 import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from soma_core.rig.neutral import ShapeSpace
+from soma_core.cache import atomic_arrays
+from soma_core.errors import InputError
+from soma_core.rig.neutral import TOPOLOGY_KEYS, ShapeSpace
 
-__all__ = ["compress_shape_space"]
+__all__ = ["compress_shape_space", "write_neutral"]
 
 
 def compress_shape_space(space: ShapeSpace, *, rms_error: float = 0.002) -> ShapeSpace:
@@ -49,3 +55,33 @@ def compress_shape_space(space: ShapeSpace, *, rms_error: float = 0.002) -> Shap
         eigenvalues=space.eigenvalues,
         metadata={**space.metadata, "rounding": rounding},
     )
+
+
+def write_neutral(
+    path: Path, topology: Mapping[str, np.ndarray], shape_space: ShapeSpace, metadata: Mapping[str, Any]
+) -> None:
+    """Write ``SOMA_neutral.npz``: deflated, no timestamps, keys sorted, atomic.
+
+    Args:
+        path: the file.
+        topology: the arrays of `TOPOLOGY_KEYS`.
+        shape_space: mean, directions and eigenvalues [cm].
+        metadata: stored as JSON; the shape space's own goes under ``provenance.shape_space``.
+
+    Raises:
+        InputError: `topology` lacks a key.
+    """
+    missing = [name for name in TOPOLOGY_KEYS if name not in topology]
+    if missing:
+        raise InputError(
+            "topology", got=f"no {missing}", expected="every key of TOPOLOGY_KEYS", fix="Add the arrays."
+        )
+    provenance = {**metadata.get("provenance", {}), "shape_space": dict(shape_space.metadata)}
+    text = json.dumps({**metadata, "provenance": provenance}, sort_keys=True)
+    arrays = {name: np.asarray(topology[name]) for name in TOPOLOGY_KEYS}
+    arrays |= {
+        key: np.asarray(getattr(shape_space, key), np.float32) for key in ("mean", "shapedirs", "eigenvalues")
+    }
+    arrays["metadata"] = np.array(text)
+    ordered = {name: arrays[name] for name in sorted(arrays)}
+    atomic_arrays(path, ordered)

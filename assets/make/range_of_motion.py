@@ -1,7 +1,7 @@
 """Make the range-of-motion clip that ships in ``assets/motions``.
 
 The clip is written here as angles at key times, interpolated smoothly, with the feet planted by
-construction: no capture data is involved. ``python -m soma_core.tasks.range_of_motion FILE`` writes it.
+construction: no capture data is involved. ``python -m assets.make.range_of_motion FILE`` writes it.
 """
 
 from __future__ import annotations
@@ -212,6 +212,7 @@ def range_of_motion(rig: Rig) -> Motion:
         fps=FPS,
         joint_names=USER_JOINTS,
         rig_revision=rig.revision,
+        # Part of the shipped bytes: where this module was when the clip was made.
         source="SOMA Core range of motion, made by soma_core.tasks.range_of_motion",
         licence="Apache-2.0",
     )

@@ -1,8 +1,8 @@
 import numpy as np
 import pytest
 
+from assets.make.symmetry import mirror_vertices
 from soma_core.errors import InputError
-from soma_core.rig.symmetry import mirror_vertices
 
 # Two boxes side by side: symmetric across x = 0, with four vertices on the midline.
 VERTICES = np.array([[x, y, z] for x in (-1.0, 0.0, 1.0) for y in (0.0, 1.0) for z in (0.0, 1.0)])

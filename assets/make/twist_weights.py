@@ -10,7 +10,7 @@ import scipy.sparse
 
 from soma_core.rig.procedural import ProceduralDefinition
 
-__all__ = ["fold_weights", "spread_weights"]
+__all__ = ["spread_weights"]
 
 _SMOOTHING = 0.1
 """Half width, as a share of the bone, over which the hat functions of the helpers are averaged. Removes the
@@ -82,7 +82,7 @@ def spread_weights(
         definition: its `main_joints` name the columns.
 
     Returns:
-        (v, J + H) float64, every value a float32; :func:`fold_weights` gives `weights` back exactly.
+        (v, J + H) float64, every value a float32; ``fold_weights`` of the rig gives `weights` back exactly.
     """
     names, helpers = definition.main_joints, definition.helpers
     place = definition.place(names)
@@ -100,11 +100,3 @@ def spread_weights(
         full[used, start] = 0
         full[used[:, None], columns] = parts
     return scipy.sparse.csr_array(full)
-
-
-def fold_weights(weights: scipy.sparse.csr_array, target: np.ndarray, count: int) -> scipy.sparse.csr_array:
-    """Add each column of skin weights (v, n) to its target column: (v, count)."""
-    moves = (np.ones(len(target)), (np.arange(len(target)), target))
-    folded = scipy.sparse.csr_array(weights @ scipy.sparse.csr_array(moves, shape=(len(target), count)))
-    folded.sort_indices()
-    return folded

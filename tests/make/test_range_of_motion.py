@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from assets.make.range_of_motion import FPS, SECONDS, main, range_of_motion
 from soma_core.io import USER_JOINTS, read_motion
 from soma_core.paths import assets_dir
 from soma_core.rig import load_canonical
-from soma_core.tasks.range_of_motion import FPS, SECONDS, main, range_of_motion
 
 CLIP = assets_dir() / "motions/range_of_motion.npz"
 

@@ -1,9 +1,9 @@
 import numpy as np
 import pytest
 
+from assets.make.segments import RiggedMesh, label_segments
 from soma_core.errors import InputError
 from soma_core.rig import load_canonical
-from soma_core.rig.segments import RiggedMesh, label_segments
 
 
 def rigged(interior: np.ndarray) -> RiggedMesh:

@@ -1,23 +1,21 @@
-"""What a conformance check is, and how it says that a backend fails it."""
+"""What a check of a backend is, and how it says that a backend fails it."""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal, TypeAlias, get_args
+from typing import Any, Literal, TypeAlias, get_args
 
 from soma_core.errors import InputError, SomaError
-
-if TYPE_CHECKING:
-    from soma_core.testing.context import Context
 
 __all__ = ["Check", "CheckFailedError", "Level", "check"]
 
 Level = Literal["core", "full"]
 """core: seconds, what every change should run; full: everything."""
 
-Body: TypeAlias = "Callable[[Context], None]"
+Body: TypeAlias = Callable[[Any], None]
+"""Takes the :class:`soma_core.testing.Context` of a backend."""
 
 _KEBAB = re.compile(r"[a-z0-9]+(-[a-z0-9]+)*")
 
@@ -52,7 +50,7 @@ class Check:
     summary: str
     run: Body
     needs: tuple[str, ...] = ()
-    unless: Callable[[Context], str] | None = None
+    unless: Callable[[Any], str] | None = None
 
     def __post_init__(self) -> None:
         if not _KEBAB.fullmatch(self.id.rpartition("/")[2]):
@@ -76,7 +74,7 @@ def check(
     *,
     level: Level = "full",
     needs: tuple[str, ...] = (),
-    unless: Callable[[Context], str] | None = None,
+    unless: Callable[[Any], str] | None = None,
 ) -> Callable[[Body], Check]:
     """Turn a function into a :class:`Check`; the first line of its docstring is the summary."""
 

@@ -5,14 +5,16 @@ import shutil
 import numpy as np
 import pytest
 
+from assets.make import build
+from assets.make.build import build_rig
+from assets.make.neutral import write_neutral
+from assets.make.source import SOURCE_SHA256, read_source, source_folder
 from soma_core.errors import AssetError
 from soma_core.paths import assets_dir
-from soma_core.rig import build, load_canonical
-from soma_core.rig.build import build_assets
+from soma_core.rig import load_canonical
 from soma_core.rig.manifest import NEUTRAL_NAME, PROCEDURAL_NAME, RIG_NAME, read_manifest
-from soma_core.rig.neutral import ShapeSpace, load_shape_space, read_topology, write_neutral
+from soma_core.rig.neutral import ShapeSpace, load_shape_space, read_topology
 from soma_core.rig.procedural_json import read_procedural
-from soma_core.rig.source import SOURCE_SHA256, read_source, source_folder
 from soma_core.rig.usd import read_usd_rig
 
 WEIGHT = 1e-7  # rows of the source sum to 1 within 4.3e-8; ours are normalised
@@ -42,7 +44,7 @@ def derive_once(monkeypatch, source, derived):
 @pytest.fixture(scope="module")
 def built(tmp_path_factory):
     root = tmp_path_factory.mktemp("assets")
-    build_assets(root)
+    build_rig(root)
     return root
 
 
@@ -97,7 +99,7 @@ def test_rebuild_gives_the_same_rig_bytes_and_the_same_arrays(built):
 @needs_source
 def test_building_twice_gives_the_same_bytes(built):
     before = {path.name: path.read_bytes() for path in built.iterdir()}
-    build_assets(built)
+    build_rig(built)
     assert {path.name: path.read_bytes() for path in built.iterdir()} == before
 
 
@@ -156,12 +158,12 @@ def test_usd_itself_skins_the_rest_pose_and_the_bind_pose_as_we_do():
 def test_trained_space_is_merged_rounded_and_then_kept(tmp_path):
     revision = read_manifest(assets_dir()).rig_revision
     path = save(tmp_path / "space.npz", trained(revision))
-    build_assets(tmp_path / "assets", path)
+    build_rig(tmp_path / "assets", path)
     merged = load_shape_space(tmp_path / "assets" / NEUTRAL_NAME)
     assert merged.component_count == 2
     assert merged.metadata["trained_on"] == "noise"
     assert merged.metadata["rounding"]["rms_vertex_error_mm"] < 0.021
-    build_assets(tmp_path / "assets")
+    build_rig(tmp_path / "assets")
     kept = load_shape_space(tmp_path / "assets" / NEUTRAL_NAME)
     np.testing.assert_array_equal(kept.shapedirs, merged.shapedirs)
     assert kept.metadata == merged.metadata
@@ -174,7 +176,7 @@ def test_trained_space_is_merged_rounded_and_then_kept(tmp_path):
 def test_space_of_another_rig_is_refused(tmp_path, space):
     path = save(tmp_path / "space.npz", space)
     with pytest.raises(AssetError, match=f"shape space of rig {space.metadata['rig_revision']}"):
-        build_assets(tmp_path / "assets", path)
+        build_rig(tmp_path / "assets", path)
 
 
 @needs_source
@@ -182,7 +184,7 @@ def test_space_of_another_rig_is_refused(tmp_path, space):
 def test_space_of_another_rig_in_the_folder_is_left_out(tmp_path, caplog):
     topology = read_topology(assets_dir() / NEUTRAL_NAME)
     write_neutral(tmp_path / NEUTRAL_NAME, topology, trained("f" * 16), {})
-    build_assets(tmp_path)
+    build_rig(tmp_path)
     assert "f" * 16 in caplog.text
     assert load_shape_space(tmp_path / NEUTRAL_NAME).component_count == 0
 

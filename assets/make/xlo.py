@@ -11,11 +11,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from assets.make.caricature import BoundSkin, draw_caricature
+from assets.make.texture_transfer import transfer_texture
 from soma_core.errors import SomaError
 from soma_core.geometry.barycentric import closest_point_on_triangle, raised_normal, tetrahedral_coordinates
-from soma_core.rig.caricature import BoundSkin, draw_caricature
-from soma_core.rig.subdivision import split_polygons
-from soma_core.rig.texture_transfer import transfer_texture
+from soma_core.geometry.mesh import split_polygons, triangle_sides
 from soma_core.topology.closest import ClosestFaces
 from soma_core.topology.fill import build_fill
 
@@ -98,13 +98,9 @@ def _decimate(points: np.ndarray, triangles: np.ndarray, count: int) -> tuple[np
     return 100 * np.array(reduced.points, np.float64), reduced.regular_faces.astype(np.int32)
 
 
-def _half_edges(triangles: np.ndarray) -> np.ndarray:
-    return np.concatenate([triangles[:, [corner, (corner + 1) % 3]] for corner in range(3)])
-
-
 def _midline_first(points: np.ndarray, triangles: np.ndarray) -> tuple[np.ndarray, np.ndarray, int]:
     """Order the vertices of an open half: first those of its boundary, of which it returns the number."""
-    edges = {tuple(edge) for edge in _half_edges(triangles).tolist()}
+    edges = {tuple(edge) for edge in triangle_sides(triangles).tolist()}
     boundary = np.unique([edge for edge in edges if edge[::-1] not in edges])
     order = np.concatenate([boundary, np.setdiff1d(np.arange(len(points)), boundary)])
     return points[order], np.argsort(order)[triangles].astype(np.int32), len(boundary)
@@ -113,7 +109,7 @@ def _midline_first(points: np.ndarray, triangles: np.ndarray) -> tuple[np.ndarra
 def _without_chords(triangles: np.ndarray, midline: int) -> np.ndarray:
     """Flip every inner edge between two vertices of the midline: its mirror image would be the same edge."""
     triangles = triangles.copy()
-    edges = _half_edges(triangles)
+    edges = triangle_sides(triangles)
     face_at = {edge: index % len(triangles) for index, edge in enumerate(map(tuple, edges.tolist()))}
     for start, end in [edge for edge in face_at if edge[0] < edge[1] < midline and edge[::-1] in face_at]:
         pair = [face_at[start, end], face_at[end, start]]
@@ -124,7 +120,7 @@ def _without_chords(triangles: np.ndarray, midline: int) -> np.ndarray:
 
 def _refuse_broken(triangles: np.ndarray, count: int, off_midline: float) -> None:
     """Refuse a mesh that is no sphere of 612 vertices, or whose halves met away from the midline."""
-    edges = _half_edges(triangles)
+    edges = triangle_sides(triangles)
     undirected, uses = np.unique(np.sort(edges, axis=1), axis=0, return_counts=True)
     closed = (uses == 2).all() and len(np.unique(edges, axis=0)) == len(edges)
     sphere = closed and count - len(undirected) + len(triangles) == 2

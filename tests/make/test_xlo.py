@@ -6,15 +6,16 @@ import sys
 import numpy as np
 import pytest
 
+from assets.make import xlo
+from assets.make.build import _low_skin
+from assets.make.caricature import BoundSkin, draw_caricature
+from assets.make.source import read_source
+from assets.make.subdivision import recover_low
+from assets.make.symmetry import mirror_vertices
 from soma_core.errors import SomaError
 from soma_core.geometry.barycentric import closest_point_on_triangle
-from soma_core.rig import load_canonical, xlo
-from soma_core.rig.build import _low_skin
-from soma_core.rig.caricature import BoundSkin, draw_caricature
-from soma_core.rig.source import read_source
-from soma_core.rig.subdivision import recover_low
-from soma_core.rig.symmetry import mirror_vertices
-from soma_core.rig.twist_weights import fold_weights
+from soma_core.rig import load_canonical
+from soma_core.rig.stored import fold_weights
 
 needs_source = pytest.mark.skipif(importlib.util.find_spec("anny") is None, reason="anny is not installed")
 
