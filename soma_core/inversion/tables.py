@@ -21,7 +21,7 @@ from soma_core.inversion.structure import MomentStructure
 
 __all__ = ["SolverTables", "solver_tables"]
 
-_SMALL = 1e-2
+_SMALL = 1e-3
 """Relative to the largest: smaller products of modes, and moments on a joint's cloud, are left out."""
 
 _DIAGONAL, _BELOW, _TURNED = 0, 1, 2

@@ -5,11 +5,13 @@ import functools
 import pytest
 import torch
 
+from soma_core.geometry.rotations import axis_angle_to_matrix
 from soma_core.inversion.gauss_newton import GaussNewton
 from soma_core.inversion.model import PoseModel
-from soma_core.inversion.priors import HINGES, PosePriors, joint_terms
+from soma_core.inversion.priors import HINGES, PosePriors, joint_terms, twist_doubt
 from soma_core.inversion.problem import Pose
 from soma_core.kernels import pose_solver_wp
+from soma_core.layer import SomaLayer
 from tests.bodies import randn
 from tests.inversion.driven_layers import as_pose, layer_of
 from tests.inversion.small_problem import pose_about, real
@@ -49,7 +51,7 @@ def targets(count, *, who=1, dtype=torch.float64, device="cpu"):
         moved = {
             name: part.to(device, dtype if part.is_floating_point() else None)
             for name, part in vars(value).items()
-            if part is not None
+            if isinstance(part, torch.Tensor)
         }
         return type(value)(**moved)
 
@@ -193,14 +195,67 @@ def test_the_tree_is_walked_like_the_reference(kind, who):
 
 @pytest.mark.parametrize("who", [1, FRAMES], ids=["one identity", "one a frame"])
 @pytest.mark.parametrize("kind", KINDS)
-def test_slopes_are_those_of_the_reference(kind, who):
-    one, pose = problem(kind, who=who)
-    model, solver = model_of(kind, warp=True), model_of(kind, warp=False).solver
-    residual = randn(FRAMES, len(solver.joints), 3, 4, seed=3)
-    expected = solver.slopes(*solver.walk(pose, one.rest), one.rest, residual)
-    constants = model._constants(one.rest)
-    found = model._steps.slopes(constants, pose.relative, pose.translation, residual)
-    assert relative_error(found, expected) < SLOPES
+def test_a_view_is_that_of_the_reference(kind, who):
+    """Error, slope, moments of what is left, and activations."""
+    given = problem(kind, who=who)
+    expected, found = (model_of(kind, warp=warp).view(*given) for warp in (False, True))
+    for name in ("energy", "slope", "residual"):
+        mine, theirs = getattr(found, name), getattr(expected, name)
+        assert relative_error(mine[:, None], theirs[:, None]) < SLOPES, name
+    if kind != "whole":
+        return
+    assert relative_error(found.pull, expected.pull) < SLOPES
+    for name in ("value", "before", "slope"):
+        mine, theirs = getattr(found.activity, name), getattr(expected.activity, name)
+        torch.testing.assert_close(mine, theirs, atol=TREE, rtol=0)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_steps_lead_to_the_same_poses(kind):
+    one, pose = problem(kind)
+    step = 0.3 * randn(FRAMES, len(model_of(kind, warp=False).solver.variables) + 1, 3, seed=9)
+    poses = []
+    for warp in (False, True):
+        model = model_of(kind, warp=warp)
+        turns, _ = model.walk(pose, one.rest)
+        short = model.solver.shortened(step, turns, None)
+        poses.append(model.moved(one, pose, turns, short))
+    for name in ("relative", "translation"):
+        torch.testing.assert_close(getattr(poses[1], name), getattr(poses[0], name), atol=TREE, rtol=0)
+
+
+@pytest.mark.parametrize("kind", ["driven", "whole"])
+@pytest.mark.parametrize("own", [False, True], ids=["one doubt", "one a frame"])
+def test_doubt_is_that_of_the_reference(kind, own):
+    one, pose = problem(kind)
+    found = []
+    for warp in (False, True):
+        model = model_of(kind, warp=warp)
+        names = [layer_of(correct=False).rig.joint_names[j] for j in model.solver.variables.tolist()]
+        doubt = twist_doubt(PosePriors(), names, dtype=torch.float64, device="cpu")
+        if own:
+            doubt = doubt.weighed(torch.linspace(0, 2, FRAMES, dtype=torch.float64))
+        found.append(model.doubted(doubt, pose.relative, model.walk(pose, one.rest)[0]))
+    assert (found[0][1] != 0).any()
+    for mine, theirs in zip(found[1], found[0], strict=True):
+        torch.testing.assert_close(mine, theirs, atol=TREE, rtol=SLOPES)
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_activations_squash_like_the_reference(dtype):
+    """Through the whole range, and relative to what is next to nothing."""
+    layer = layer_of(correct=True)
+    model = PoseModel(SomaLayer(layer.backend, lod=layer.mesh.lod, dtype=dtype), plain=False, warp=True)
+    identity = model.seen(SomaLayer(layer.backend, lod=layer.mesh.lod, dtype=dtype).identity())
+    rest = model.rest(identity, torch.ones(1, len(model.fitted), dtype=dtype))
+    relative = axis_angle_to_matrix(1.2 * randn(64, len(layer.rig.parents), 3, seed=4).to(dtype))
+    _, _, _, value, before, slope = model._steps.posed(model._constants(rest), relative, relative[:, 0, 0])
+    expected = torch.tanh(torch.relu(before.double()))
+    assert before.max() > 2
+    rounding = 4 * torch.finfo(dtype).eps
+    torch.testing.assert_close(value.double(), expected, rtol=rounding, atol=0)
+    rising = (before > 0) * (1 - expected.square())
+    torch.testing.assert_close(slope.double(), rising, rtol=0, atol=rounding)
 
 
 @pytest.mark.parametrize("held", [False, True], ids=["free", "terms and hinges"])
