@@ -22,9 +22,9 @@ from soma_core.io.usd import write_usd
 from soma_core.layer import SomaLayer
 from soma_core.paths import assets_dir
 from soma_core.progress import progress
-from soma_core.tasks.picture import backend_colour, contact_sheet
-from soma_core.tasks.stage import Body
 from soma_core.tasks.stored_identity import backend_of, stored_identity
+from soma_core.view.picture import backend_colour, contact_sheet
+from soma_core.view.stage import Body
 
 if TYPE_CHECKING:
     from omegaconf import DictConfig

@@ -11,8 +11,8 @@ import torch
 
 from soma_core.inversion.report import InversionReport
 from soma_core.io.motion import Motion
-from soma_core.tasks.error_picture import error_sheet
-from soma_core.tasks.stage import Body
+from soma_core.view.error_picture import error_sheet
+from soma_core.view.stage import Body
 
 if TYPE_CHECKING:
     from soma_core.inversion.result import InversionResult

@@ -16,8 +16,8 @@ from soma_core.plugin.errors import BackendError
 from soma_core.plugin.registry import default_registry
 from soma_core.shape_space.sampling import sample_parameters
 from soma_core.tasks.animate import animate, load_motion
-from soma_core.tasks.picture import backend_colour, gallery
-from soma_core.tasks.stage import Body
+from soma_core.view.picture import backend_colour, gallery
+from soma_core.view.stage import Body
 
 if TYPE_CHECKING:
     from omegaconf import DictConfig

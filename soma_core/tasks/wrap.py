@@ -53,7 +53,7 @@ def run(config: DictConfig, output: Path) -> None:
     write_report(folder, found, quality, native=pair.native.name)
     _say(found, quality, pair, config.fill)
     if config.picture:
-        from soma_core.tasks.wrap_picture import draw_wrap
+        from soma_core.view.wrap_picture import draw_wrap
 
         draw_wrap(folder / "wrap.png", found, quality, mesh)
 
