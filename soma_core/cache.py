@@ -15,7 +15,7 @@ from soma_core.errors import AssetError
 from soma_core.npz import open_npz_file
 from soma_core.paths import cache_dir
 
-__all__ = ["atomic_write", "cached_arrays", "content_key", "file_sha256"]
+__all__ = ["atomic_text", "atomic_write", "cached_arrays", "content_key", "file_sha256"]
 
 _log = logging.getLogger(__name__)
 
@@ -57,6 +57,11 @@ def atomic_write(path: Path, write: Callable[[Path], None]) -> None:
         temporary.replace(path)
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def atomic_text(path: Path, text: str) -> None:
+    """Write `text` as UTF-8, whole or not at all."""
+    atomic_write(path, lambda temporary: temporary.write_text(text, encoding="utf-8") and None)
 
 
 def _read(path: Path) -> dict[str, np.ndarray] | None:
