@@ -24,7 +24,7 @@ TREE_MIB = 24
 
 # A package imports from lower ranks and its own, never from higher ones.
 RANKS = [
-    {"errors", "paths", "cache", "files", "npz", "progress"},
+    {"errors", "paths", "cache", "files", "npz", "progress", "options"},
     {"geometry", "plugin"},
     {"kernels", "_inputs"},
     {"rig", "topology", "skeleton", "animation", "correctives"},
@@ -33,6 +33,7 @@ RANKS = [
     {"inversion"},
     {"native", "registration"},
     {"view"},
+    {"motion"},
     {"config", "shape_space", "template", "testing"},
     {"evaluation"},
     {"tasks"},

@@ -15,10 +15,10 @@ import torch
 from omegaconf import OmegaConf
 
 from soma_core.cache import atomic_write
-from soma_core.config.choices import Upward
 from soma_core.errors import SomaError
 from soma_core.inversion.diagnosis import Diagnosis, diagnose_fit
 from soma_core.io.motion_files import write_motion_parts
+from soma_core.options import Upward
 from soma_core.progress import progress
 from soma_core.tasks.fit_results import chunk_arrays, draw_worst, fitted_motions, joined_report, per_frame
 

@@ -7,11 +7,11 @@ import pytest
 import torch
 
 from soma_core import SomaLayer
-from soma_core.config.schema import BackendChoice
 from soma_core.errors import InputError
 from soma_core.inversion import PoseInversion
 from soma_core.io import open_vertex_sequence, write_motion
 from soma_core.io.amass import read_amass
+from soma_core.options import BackendChoice
 from soma_core.tasks import convert_back
 from soma_core.tasks.convert_back import BackConverter
 from soma_core.tasks.fit_job import ResultFiles

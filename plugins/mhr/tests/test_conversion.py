@@ -7,9 +7,10 @@ import pytest
 import torch
 from omegaconf import OmegaConf
 
-from soma_core.config.schema import ConvertConfig, IdentityMethod
+from soma_core.config.schema import ConvertConfig
 from soma_core.errors import AssetError, InputError
 from soma_core.io import read_motion
+from soma_core.options import IdentityMethod
 from soma_core.plugin.errors import BackendError
 from soma_core.plugin.registry import Registry
 from soma_core.tasks.convert_file import Converter

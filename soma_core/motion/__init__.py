@@ -1,0 +1,3 @@
+"""Motions of other tools to this skeleton and back."""
+
+__all__: list[str] = []
