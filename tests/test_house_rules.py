@@ -150,6 +150,17 @@ def test_imports_follow_the_arrows(path: Path) -> None:
         assert allowed, f"{_label(path)} imports soma_core.{part}, against the arrows"
 
 
+@pytest.mark.parametrize("path", [p for p in SOURCES if p.is_relative_to(ROOT / "soma_core")], ids=_label)
+def test_the_library_knows_no_hydra(path: Path) -> None:
+    if RANK.get(_package(path), 0) < RANK["config"]:
+        assert not _imported_packages(_tree(path)) & {"hydra", "omegaconf"}
+
+
+@pytest.mark.parametrize("path", sorted((ROOT / "plugins").glob("*/**/*.py")), ids=_label)
+def test_plugins_import_no_command(path: Path) -> None:
+    assert not {"tasks", "cli", "config"} & set(_imported_parts(_tree(path)))
+
+
 @pytest.mark.parametrize("path", sorted((ROOT / "soma_core" / "plugin").glob("*.py")), ids=_label)
 def test_the_plugin_contract_is_light(path: Path) -> None:
     # torch is named in annotations, under TYPE_CHECKING; nothing else heavy may be.

@@ -88,3 +88,20 @@ class ConvertOptions(FitOptions):
     most_betas: int | None = None
     betas: list[float] | None = None
     translation: Translation = Translation.motion
+
+    def __post_init__(self) -> None:
+        """Refuse settings of the other direction, which would change nothing."""
+        super().__post_init__()
+        sought = None if self.identity.method == "known" else str(self.identity.method)
+        if self.to != "soma":
+            unused, why = {"identity.method": sought, "most_betas": self.most_betas}, f"to={self.to}"
+        else:
+            placed = None if self.translation == "motion" else str(self.translation)
+            unused = {"betas": self.betas, "result": self.result, "translation": placed}
+            if self.backend is not None and sought is None and self.backend.name != "mhr":
+                unused["backend"] = self.backend.name  # a file tells its own model
+            why = "to=soma" if sought else "to=soma and identity=known"
+        for name, value in unused.items():
+            if value is not None:
+                fix = f"Leave {name.partition('.')[0]} out."
+                raise InputError(name, got=str(value), expected=f"none with {why}", fix=fix)

@@ -8,7 +8,10 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from omegaconf import OmegaConf
+
 from soma_core.errors import AssetError, InputError
+from soma_core.options import BackendChoice
 from soma_core.plugin.registry import default_registry
 from soma_core.plugin.spec import WrapPair
 from soma_core.registration.native_mesh import NativeMesh, neutral_mesh, read_native_mesh
@@ -16,7 +19,6 @@ from soma_core.registration.pair_files import write_pair, write_report
 from soma_core.registration.quality import Quality, measure
 from soma_core.registration.register import Registration, WrapOptions, register
 from soma_core.rig import load_canonical
-from soma_core.tasks.animate import given_params
 
 if TYPE_CHECKING:
     from omegaconf import DictConfig
@@ -80,8 +82,8 @@ def _read_native(config: DictConfig) -> NativeMesh:
             fix="Pass native=BODY.obj or backend=NAME.",
         )
     if chosen:
-        options, params = given_params(config.backend.options), given_params(config.backend.params)
-        return neutral_mesh(default_registry(), config.backend.name, options=options, params=params)
+        backend: BackendChoice = OmegaConf.to_object(config.backend)
+        return neutral_mesh(default_registry(), backend.name, options=backend.options, params=backend.params)
     return read_native_mesh(Path(config.native).expanduser())
 
 

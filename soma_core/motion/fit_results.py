@@ -17,8 +17,8 @@ from soma_core.view.stage import Body
 if TYPE_CHECKING:
     from soma_core.inversion.result import InversionResult
     from soma_core.layer import SomaLayer
+    from soma_core.motion.chunks import FittedChunks
     from soma_core.skeleton.identity import Identity
-    from soma_core.tasks.fitted_chunks import FittedChunks
 
 __all__ = ["chunk_arrays", "draw_worst", "fitted_motions", "joined_report", "per_frame", "worst_frames"]
 
