@@ -14,36 +14,48 @@ from soma_core.options import (
     InversionChoice,
     LengthUnit,
     ModelOptions,
+    Options,
     Picture,
     Topology,
     Translation,
     Upward,
 )
 
-__all__ = ["ConvertOptions", "FitOptions", "InvertOptions"]
+__all__ = ["ConvertOptions", "FitOptions", "InvertOptions", "SourceOptions"]
 
 
 @dataclass(kw_only=True)
-class FitOptions(ModelOptions):
-    """What every fit takes.
+class SourceOptions(Options):
+    """Whose body a file shows, how its poses are found, and what the file itself does not say.
 
     Attributes:
-        identity: whose poses are sought: a known body, or one that is found as well.
+        backend: the body, or where the search for it begins.
+        identity: a known body, or one that is found as well.
         inversion: how poses are found.
-        fps: frames per second, of files that do not say.
-        unit: of files that do not say.
-        up: upward axis, of files that do not say.
-        lod: of the fit.
-        chunk: frames in memory at once; finished chunks are kept until the end.
-        picture: the worst frames, coloured by their error.
+        fps: frames per second.
+        unit: of lengths.
+        up: upward axis.
     """
 
-    lod: FitLod = FitLod.mid
+    backend: BackendChoice | None = None
     identity: IdentityChoice = field(default_factory=IdentityChoice)
     inversion: InversionChoice = field(default_factory=InversionChoice)
     fps: float | None = None
     unit: LengthUnit | None = None
     up: Upward | None = None
+
+
+@dataclass(kw_only=True)
+class FitOptions(ModelOptions, SourceOptions):
+    """What every fit takes: the file, the model, and how far the work goes at a time.
+
+    Attributes:
+        lod: of the fit.
+        chunk: frames in memory at once; finished chunks are kept until the end.
+        picture: the worst frames, coloured by their error.
+    """
+
+    lod: FitLod = FitLod.mid  # type: ignore[assignment]  # a part of the model's choice
     chunk: int = 256
     picture: Picture = field(default_factory=lambda: Picture(frames=0))
 
@@ -59,7 +71,6 @@ class InvertOptions(FitOptions):
     """A fit to vertices over time.
 
     Attributes:
-        backend: whose body they are, or where the search for it begins.
         topology: which mesh they are vertices of; ``auto`` tells it by their number.
     """
 
@@ -81,7 +92,6 @@ class ConvertOptions(FitOptions):
         translation: where the body stands, on the way back.
     """
 
-    backend: BackendChoice | None = None
     to: str = "soma"
     result: ConvertResult | None = None
     gender: BodyGender | None = None
@@ -93,9 +103,9 @@ class ConvertOptions(FitOptions):
         """Refuse settings of the other direction, which would change nothing."""
         super().__post_init__()
         sought = None if self.identity.method == "known" else str(self.identity.method)
-        if self.to != "soma":
-            unused, why = {"identity.method": sought, "most_betas": self.most_betas}, f"to={self.to}"
-        else:
+        unused: dict[str, object] = {"identity.method": sought, "most_betas": self.most_betas}
+        why = f"to={self.to}"
+        if self.to == "soma":
             placed = None if self.translation == "motion" else str(self.translation)
             unused = {"betas": self.betas, "result": self.result, "translation": placed}
             if self.backend is not None and sought is None and self.backend.name != "mhr":
