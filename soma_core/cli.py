@@ -119,7 +119,7 @@ def _run_task(name: str, overrides: Sequence[str]) -> int:
 
 def _make_missing_wrap(name: str, options: Mapping[str, Any]) -> None:
     """Registration is imported when a backend lacks its wrap."""
-    importlib.import_module("soma_core.tasks.missing_wrap").make_missing_wrap(name, options)
+    importlib.import_module("soma_core.registration.missing_wrap").make_missing_wrap(name, options)
 
 
 def _shown(folder: Path) -> str:

@@ -23,8 +23,7 @@ _FOLDERS = ("soma_core/**/*.py", "plugins/*/soma_backend_*/**/*.py", "assets/mak
 SOURCES = sorted(path for pattern in _FOLDERS for path in ROOT.glob(pattern))
 
 # What the author of a backend writes: our own plugins, their tests, and what a new one starts from.
-_CONVERSION = ROOT / "plugins/mhr/tests/test_conversion.py"  # of the conversion, which has no public name yet
-AUTHORS = sorted({*ROOT.glob("plugins/**/*.py"), *ROOT.glob("soma_core/template/files/*.in")} - {_CONVERSION})
+AUTHORS = sorted({*ROOT.glob("plugins/**/*.py"), *ROOT.glob("soma_core/template/files/*.in")})
 _IMPORT_OF_CORE = re.compile(
     r"^[ \t]*(?:from|import)[ \t]+(soma_core[\w.]*)(?:[ \t]+import[ \t]+(\([^)]*\)|.*))?$", re.MULTILINE
 )
@@ -36,15 +35,17 @@ TREE_MIB = 24
 
 # A package imports from lower ranks and its own, never from higher ones.
 RANKS = [
-    {"_lazy", "_version", "errors", "paths", "cache", "files", "npz", "obj", "progress"},
+    {"_lazy", "_version", "errors", "paths", "cache", "files", "npz", "obj", "options", "progress"},
     {"geometry", "plugin"},
     {"kernels", "_inputs", "_derived"},
     {"rig", "topology", "skeleton", "animation", "correctives"},
     {"backends", "io"},
     {"layer"},
     {"inversion"},
-    {"native"},
-    {"config", "registration", "shape_space", "template", "testing"},
+    {"native", "registration"},
+    {"view"},
+    {"motion"},
+    {"config", "shape_space", "template", "testing"},
     {"evaluation"},
     {"tasks"},
     {"cli"},
@@ -52,7 +53,7 @@ RANKS = [
 RANK = {name: rank for rank, names in enumerate(RANKS) for name in names}
 
 # Lists of names that are loaded when they are first used; they follow no arrow.
-LISTS = {"soma_core/__init__.py", "soma_core/plugin/__init__.py"}
+LISTS = {"soma_core/__init__.py", "soma_core/motion/__init__.py", "soma_core/plugin/__init__.py"}
 
 # Packages that stand alone: nothing else of the core, whatever its rank.
 ALONE = {"geometry": {"errors"}, "plugin": {"_lazy", "_version", "errors", "paths", "cache"}}
@@ -62,7 +63,6 @@ KNOWN_CYCLES = [
     {"soma_core.inversion.gauss_newton", "soma_core.inversion.offsets", "soma_core.inversion.tables"},
     {"soma_core.inversion.curvature", "soma_core.inversion.skin_model"},
     {"soma_core.inversion.ladder", "soma_core.inversion.whole"},
-    {"soma_core.tasks.animate", "soma_core.tasks.gallery"},
 ]
 
 TOP_LEVEL = {"soma_core", "plugins", "assets", "configs", "tests", "benchmarks", "docs", ".ci"}
@@ -78,6 +78,11 @@ PUBLIC_NAMES = {
         load_shape_space
         open_vertex_sequence read_amass read_motion read_sam3d skinned_clip write_amass write_gltf
         write_motion write_usd
+    """,
+    "soma_core.motion": """
+        Animated BackendChoice ConvertOptions Converted FitOptions FitPlan FolderConverted IdentityChoice
+        InversionChoice InvertOptions Picture animate convert convert_file convert_folder finish_fit
+        fit_chunks invert layout_of load_clip plan_fit read stored_identity write
     """,
     "soma_core.plugin": """
         API_VERSION Axis BackendSpec BrokenBackendError Check CheckFailedError ClosestFaces FileNeeded
@@ -204,6 +209,17 @@ def test_no_imports_go_in_a_circle() -> None:
     new = [sorted(circle) for circle in circles if not any(circle <= known for known in KNOWN_CYCLES)]
     assert not new, f"imports go in a circle: {new}"
     assert not [name for name, others in graph.items() if name in others], "a module imports itself"
+
+
+@pytest.mark.parametrize("path", [p for p in SOURCES if p.is_relative_to(ROOT / "soma_core")], ids=_label)
+def test_the_library_knows_no_hydra(path: Path) -> None:
+    if RANK.get(_package(path), 0) < RANK["config"]:
+        assert not _imported_packages(_tree(path)) & {"hydra", "omegaconf"}
+
+
+@pytest.mark.parametrize("path", sorted((ROOT / "plugins").glob("*/**/*.py")), ids=_label)
+def test_plugins_import_no_command(path: Path) -> None:
+    assert not {"tasks", "cli", "config"} & set(_imported_parts(_tree(path)))
 
 
 @pytest.mark.parametrize("path", sorted((ROOT / "soma_core" / "plugin").glob("*.py")), ids=_label)

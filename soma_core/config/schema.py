@@ -8,38 +8,30 @@ from typing import Any
 from hydra.core.config_store import ConfigStore
 from omegaconf import MISSING
 
-from soma_core.config.choices import (
-    BodyGender,
-    ConvertResult,
+from soma_core.motion.options import ConvertOptions, InvertOptions
+from soma_core.options import (
+    BackendChoice,
     FitLod,
+    FrameRange,
     Gallery,
-    IdentityMethod,
     IdentitySource,
     Kernels,
     LengthUnit,
-    Lod,
+    ModelOptions,
+    Options,
+    Picture,
     Product,
-    Topology,
     Translation,
-    Upward,
 )
 
 __all__ = [
-    "AnalyticalChoice",
     "AnimateConfig",
-    "AutogradChoice",
-    "BackendChoice",
     "BenchConfig",
     "ConvertConfig",
     "CorrectivesData",
     "EvaluateConfig",
     "Experiment",
-    "FrameRange",
-    "IdentityChoice",
-    "InversionChoice",
     "InvertConfig",
-    "Picture",
-    "PriorChoice",
     "TrainCorrectivesConfig",
     "TrainShapeConfig",
     "WrapConfig",
@@ -47,160 +39,49 @@ __all__ = [
 ]
 
 
-@dataclass
-class BackendChoice:
-    """An identity: the backend, its parameters (null: the default) and its options."""
-
-    name: str = MISSING
-    params: dict[str, Any] = field(default_factory=dict)
-    options: dict[str, Any] = field(default_factory=dict)
+def _any_backend() -> BackendChoice:
+    """A backend that is yet to be chosen."""
+    return BackendChoice(name=MISSING)
 
 
-@dataclass
-class FrameRange:
-    """A slice of the motion, as in Python: stop is left out, null means to the end."""
+@dataclass(kw_only=True)
+class _PlayedMotion(Options):
+    """Which motion is played, on whose body."""
 
-    start: int = 0
-    stop: int | None = None
-    step: int = 1
-
-
-@dataclass
-class Picture:
-    """The contact sheet: how many frames, and its width in pixels."""
-
-    frames: int = 10
-    width: int = 1600
-
-
-@dataclass
-class AnimateConfig:
-    """Configuration of ``soma animate``."""
-
-    backend: BackendChoice = field(default_factory=BackendChoice)
+    backend: BackendChoice = field(default_factory=_any_backend)
     backends: Gallery = Gallery.one
     motion: str | None = None
     motion_fps: float | None = None
     identity_from: IdentitySource = IdentitySource.backend
     frames: FrameRange = field(default_factory=FrameRange)
     translation: Translation = Translation.ground
-    lod: Lod = Lod.mid
-    kernels: Kernels = Kernels.auto
-    procedural: bool = True
-    correctives: str | None = "auto"
-    device: str = "cpu"
+
+
+@dataclass(kw_only=True)
+class AnimateConfig(ModelOptions, _PlayedMotion):
+    """Configuration of ``soma animate``."""
+
     seed: int = 0
     write: list[Product] = field(default_factory=lambda: list(Product))
     picture: Picture = field(default_factory=Picture)
 
 
-@dataclass
-class AnalyticalChoice:
-    """Sweeps of the stage ``analytical`` over all but the fingers, the fingers, and everything."""
-
-    body: int = 2
-    fingers: int = 0
-    full: int = 1
-
-
-@dataclass
-class AutogradChoice:
-    """Stage ``autograd``: steps, learning rates [rad, m], how far they fall, factors of regions, the loss."""
-
-    iterations: int = 100
-    rate: float = 0.02
-    shift_rate: float = 0.002
-    final: float = 0.005
-    regions: dict[str, float] = field(default_factory=dict)
-    loss: str = "moments"
-
-
-@dataclass
-class PriorChoice:
-    """Soft terms [m/rad]: limits of joints [rad], a rest pose, smooth motion; hinges: elbows and knees.
-
-    `untwist` is a factor on how much twists of elbows, knees and fingers are in doubt; 0 turns that off.
-    """
-
-    untwist: float = 1.0
-    limits: dict[str, float] = field(default_factory=dict)
-    limit_strength: float = 0.05
-    hinges: bool = False
-    rest_strength: float = 0.0
-    temporal_strength: float = 0.0
-    temporal_rounds: int = 3
-
-
-@dataclass
-class InversionChoice:
-    """How poses are found: the stages in their order, and what each of them takes."""
-
-    stages: list[str] = field(default_factory=lambda: ["procrustes", "gauss_newton"])
-    iterations: int = 40
-    tolerance: float = 2e-5
-    robust: float | None = None
-    robust_rounds: int = 10
-    refreshes: int = 30
-    analytical: AnalyticalChoice = field(default_factory=AnalyticalChoice)
-    autograd: AutogradChoice = field(default_factory=AutogradChoice)
-    priors: PriorChoice = field(default_factory=PriorChoice)
-    kernels: Kernels = Kernels.auto
-
-
-@dataclass
-class IdentityChoice:
-    """Whose poses are sought: a known identity, or one found from some of the frames."""
-
-    method: IdentityMethod = IdentityMethod.known
-    free: list[str] | None = None
-    frames: int = 20
-    iterations: int = 12
-
-
-@dataclass
-class InvertConfig:
+@dataclass(kw_only=True)
+class InvertConfig(InvertOptions):
     """Configuration of ``soma invert``."""
 
-    backend: BackendChoice = field(default_factory=BackendChoice)
-    identity: IdentityChoice = field(default_factory=IdentityChoice)
-    inversion: InversionChoice = field(default_factory=InversionChoice)
+    backend: BackendChoice = field(default_factory=_any_backend)
     input: str | None = None
-    fps: float | None = None
-    unit: LengthUnit | None = None
-    up: Upward | None = None
-    topology: Topology = Topology.auto
-    lod: FitLod = FitLod.mid
-    procedural: bool = True
-    correctives: str | None = "auto"
-    device: str = "cpu"
     seed: int = 0
-    chunk: int = 256
-    picture: Picture = field(default_factory=lambda: Picture(frames=5))
 
 
-@dataclass
-class ConvertConfig:
+@dataclass(kw_only=True)
+class ConvertConfig(ConvertOptions):
     """Configuration of ``soma convert``."""
 
-    backend: BackendChoice | None = None
-    identity: IdentityChoice = field(default_factory=IdentityChoice)
-    inversion: InversionChoice = field(default_factory=InversionChoice)
     input: str | None = None
     out: str = MISSING
-    to: str = "soma"
-    result: ConvertResult | None = None
-    fps: float | None = None
-    unit: LengthUnit | None = None
-    up: Upward | None = None
-    gender: BodyGender | None = None
-    most_betas: int | None = None
-    betas: list[float] | None = None
-    translation: Translation = Translation.motion
-    lod: FitLod = FitLod.mid
-    device: str = "cpu"
     seed: int = 0
-    chunk: int = 256
-    picture: Picture = field(default_factory=lambda: Picture(frames=5))
 
 
 @dataclass
@@ -283,7 +164,7 @@ class EvaluateConfig:
 class BenchConfig:
     """Configuration of ``soma bench``."""
 
-    backend: BackendChoice = field(default_factory=BackendChoice)
+    backend: BackendChoice = field(default_factory=_any_backend)
     batches: list[int] = field(default_factory=lambda: [1, 8, 32, 128])
     kernels: Kernels = Kernels.auto
     device: str = "cpu"

@@ -11,7 +11,6 @@ import numpy as np
 import torch
 from omegaconf import OmegaConf
 
-from soma_core.config.schema import InversionChoice
 from soma_core.errors import InputError
 from soma_core.evaluation.inversion_sequences import MovingMesh
 from soma_core.evaluation.joint_turns import TurnExcess, angles_between, turn_excess
@@ -21,6 +20,7 @@ from soma_core.inversion import InversionResult, PoseInversion
 from soma_core.inversion.options import inversion_options
 from soma_core.inversion.report import InversionReport
 from soma_core.layer import SomaLayer
+from soma_core.options import InversionChoice
 from soma_core.paths import configs_dir
 from soma_core.progress import progress
 

@@ -4,57 +4,35 @@ from __future__ import annotations
 
 import json
 import logging
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
 from omegaconf import OmegaConf
 
-from soma_core.errors import InputError
 from soma_core.io.clip import skinned_clip
 from soma_core.io.gltf import write_gltf
-from soma_core.io.motion import Motion
-from soma_core.io.motion_files import check_rig, read_motion, write_motion
 from soma_core.io.usd import write_usd
-from soma_core.layer import SomaLayer
-from soma_core.paths import assets_dir
-from soma_core.progress import progress
-from soma_core.tasks.picture import backend_colour, contact_sheet
-from soma_core.tasks.stage import Body
-from soma_core.tasks.stored_identity import backend_of, stored_identity
+from soma_core.motion.animated import Animated, animate, load_clip
+from soma_core.motion.files import write
+from soma_core.motion.identities import backend_of, stored_identity
+from soma_core.motion.models import open_layer
+from soma_core.view.picture import backend_colour, contact_sheet
+from soma_core.view.stage import Body
 
 if TYPE_CHECKING:
     from omegaconf import DictConfig
 
-    from soma_core.animation.posed import Posed
+    from soma_core.config.schema import AnimateConfig
+    from soma_core.io.motion import Motion
+    from soma_core.layer import SomaLayer
     from soma_core.skeleton.identity import Identity
 
-__all__ = ["Animated", "animate", "given_params", "load_motion", "run"]
+__all__ = ["run"]
 
 _log = logging.getLogger(__name__)
-
-_CHUNK = 64
-"""Frames posed at once: 18,056 vertices of 64 frames in float32 are 14 MB."""
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Animated:
-    """A motion on one identity.
-
-    Attributes:
-        motion: the motion with the translation that was used.
-        transforms: (frames, J, 4, 4) float32 world transforms [m].
-        helpers: (frames, H, 4, 4) float32 world transforms of the twist joints [m]; H = 0 without them.
-        vertices: frame -> posed vertices (v, 3) [m], for the frames asked for.
-    """
-
-    motion: Motion
-    transforms: np.ndarray
-    helpers: np.ndarray
-    vertices: Mapping[int, np.ndarray]
 
 
 def run(config: DictConfig, output: Path) -> None:
@@ -66,52 +44,26 @@ def run(config: DictConfig, output: Path) -> None:
     Raises:
         SomaError: the backend, its parameters or the motion cannot be used.
     """
-    if config.backends == "all":
+    options: AnimateConfig = OmegaConf.to_object(config)
+    if options.backends == "all":
         from soma_core.tasks.gallery import draw_gallery
 
-        draw_gallery(config, output / "gallery.png")
+        draw_gallery(options, output / "gallery.png")
         return
-    motion = load_motion(config)
-    kept = str(config.identity_from) == "motion"
-    options = given_params(config.backend.options)
-    layer = SomaLayer(
-        backend_of(motion) if kept else config.backend.name,
-        options={**motion.identity.get("options", {}), **options} if kept else options,
-        lod=str(config.lod),
-        device=config.device,
-        kernels=str(config.kernels),
-        procedural=config.procedural,
-        correctives=config.correctives,
-    )
-    stored = {"backend": layer.backend, "params": given_params(config.backend.params)}
-    stored = dict(motion.identity) if kept else stored
+    motion = load_clip(options.motion, fps=options.motion_fps, frames=options.frames)
+    kept, chosen = options.identity_from == "motion", options.backend
+    name, own = chosen.name, chosen.options
+    if kept:
+        name, own = backend_of(motion), {**motion.identity.get("options", {}), **own}
+    layer = open_layer(options, name, own)
+    stored = dict(motion.identity) if kept else {"backend": layer.backend, "params": chosen.params}
     _log.info("%s: %d frames at %g fps", motion.source, motion.frame_count, motion.fps)
     with torch.no_grad():
         identity = stored_identity(layer, stored)
-        shown = _shown_frames(motion.frame_count, config.picture.frames)
-        result = animate(layer, identity, motion, translation=str(config.translation), keep=shown)
+        shown = _shown_frames(motion.frame_count, options.picture.frames)
+        result = animate(layer, identity, motion, translation=str(options.translation), keep=shown)
     motion = replace(result.motion, identity=stored)
-    _write(config, output, layer, identity, replace(result, motion=motion))
-
-
-def load_motion(config: DictConfig) -> Motion:
-    """Motion that the configuration names, cut to its frames; the shipped clip where it names none."""
-    path = Path(config.motion).expanduser() if config.motion else assets_dir() / "motions/range_of_motion.npz"
-    motion = read_motion(path, fps=config.motion_fps)
-    part = slice(config.frames.start, config.frames.stop, config.frames.step)
-    if part.step < 1 or not len(range(motion.frame_count)[part]):
-        raise InputError(
-            "frames",
-            got=f"start={part.start}, stop={part.stop}, step={part.step}",
-            expected=f"a step of at least 1 and a range inside the {motion.frame_count} frames",
-            fix="Give frames.start, frames.stop and frames.step inside the motion.",
-        )
-    return replace(
-        motion,
-        rotations=motion.rotations[part],
-        translation=motion.translation[part],
-        fps=motion.fps / part.step,
-    )
+    _write(options, output, layer, identity, replace(result, motion=motion))
 
 
 def _shown_frames(frame_count: int, count: int) -> list[int]:
@@ -119,111 +71,14 @@ def _shown_frames(frame_count: int, count: int) -> list[int]:
     return np.unique((np.arange(count) + 0.5) * frame_count / count).astype(int).tolist()
 
 
-def given_params(values: Mapping[str, Any]) -> dict[str, Any]:
-    """Entries of a configuration group that hold a value; null means the default."""
-    plain = OmegaConf.to_container(OmegaConf.create(values), resolve=True)
-    return {str(name): value for name, value in plain.items() if value is not None}
-
-
-def animate(
-    layer: SomaLayer,
-    identity: Identity,
-    motion: Motion,
-    *,
-    translation: str = "ground",
-    keep: list[int] | None = None,
-) -> Animated:
-    """Pose one identity by every frame of a motion.
-
-    Args:
-        layer: the forward path.
-        identity: one identity.
-        motion: rotations and Hips positions [m].
-        translation: ``ground`` scales the Hips path by the length of the legs and puts the lowest vertex
-            of the clip on y = 0; ``motion`` takes it as recorded; ``none`` leaves Hips where the identity
-            rests and puts the lowest vertex on y = 0.
-        keep: frames whose vertices are returned.
-
-    Raises:
-        InputError: absolute rotations that were made for another rig.
-    """
-    if not check_rig(motion, layer.rig.revision):
-        _log.info("the motion was made for rig %s; its relative rotations carry over", motion.rig_revision)
-    path = _hips_path(layer, identity, motion, translation)
-    transforms, helpers, vertices, lowest = [], [], {}, np.inf
-    wanted = set(keep or ())
-    for start, posed in _posed_chunks(layer, identity, motion, path):
-        transforms.append(posed.transforms.cpu().numpy())
-        helpers.append(layer.helper_transforms(identity, posed.transforms).cpu().numpy())
-        lowest = min(lowest, float(posed.vertices[..., 1].min()))
-        for frame in wanted & set(range(start, start + len(posed.vertices))):
-            vertices[frame] = posed.vertices[frame - start].cpu().numpy().copy()
-    shift = np.array([0, 0 if translation == "motion" else -lowest, 0], np.float32)
-    world, carried = np.concatenate(transforms), np.concatenate(helpers)
-    world[:, 1:, :3, 3] += shift  # Root, which is virtual, stays at the origin
-    carried[..., :3, 3] += shift
-    return Animated(
-        motion=replace(motion, translation=path + shift, rig_revision=layer.rig.revision),
-        transforms=world,
-        helpers=carried,
-        vertices={frame: vertices[frame] + shift for frame in sorted(vertices)},
-    )
-
-
-def _posed_chunks(
-    layer: SomaLayer, identity: Identity, motion: Motion, path: np.ndarray
-) -> Iterator[tuple[int, Posed]]:
-    """First frame and posed body of each chunk."""
-    absolute = motion.convention == "absolute_local"
-    starts = range(0, motion.frame_count, _CHUNK)
-    shown = (
-        progress(starts, label="posing", total=len(starts), lines=4, after=5.0) if len(starts) > 1 else starts
-    )
-    for start in shown:
-        part = slice(start, start + _CHUNK)
-        rotations = torch.as_tensor(motion.rotations[part], dtype=layer.dtype, device=layer.device)
-        hips = torch.as_tensor(path[part], dtype=layer.dtype, device=layer.device)
-        yield start, layer.pose(identity, rotations, hips, absolute=absolute)
-
-
-def _leg_length(world: np.ndarray, names: tuple[str, ...]) -> float:
-    """Mean length of thigh and shin together [m]."""
-    place = {name: world[index, :3, 3] for index, name in enumerate(names)}
-    chains = [
-        (f"{side}{a}", f"{side}{b}")
-        for side in ("Left", "Right")
-        for a, b in (("Leg", "Shin"), ("Shin", "Foot"))
-    ]
-    return float(sum(np.linalg.norm(place[a] - place[b]) for a, b in chains) / 2)
-
-
-def _hips_path(layer: SomaLayer, identity: Identity, motion: Motion, translation: str) -> np.ndarray:
-    """Hips positions [m] before the body is put on the ground, (frames, 3) float32."""
-    if translation == "motion":
-        return motion.translation
-    bind = identity.bind_world[0].detach().cpu().double().numpy()
-    names = layer.rig.joint_names
-    if translation == "none":
-        hips = bind[names.index("Hips"), :3, 3].astype(np.float32)
-        return np.tile(hips, (motion.frame_count, 1))
-    if translation != "ground":
-        raise InputError(
-            "translation",
-            got=repr(translation),
-            expected="'ground', 'motion' or 'none'",
-            fix="Choose where the body stands.",
-        )
-    ratio = _leg_length(bind, names) / _leg_length(layer.rig.bind_world, names)
-    return (motion.translation * ratio).astype(np.float32)
-
-
-def _write(config: DictConfig, output: Path, layer: SomaLayer, identity: Identity, result: Animated) -> None:
+def _write(
+    options: AnimateConfig, output: Path, layer: SomaLayer, identity: Identity, result: Animated
+) -> None:
     """Write the files that the configuration asks for."""
-    products = {str(product) for product in config.write}
+    products = {str(product) for product in options.write}
     motion = result.motion
     if "npz" in products:
-        orient = layer.rig.t_pose_world[1:, :3, :3]
-        write_motion(motion, output / "motion.npz", joint_orient=orient)
+        write(motion, output / "motion.npz")
     if products & {"usd", "glb"}:
         clip = skinned_clip(
             layer.mesh,
@@ -249,7 +104,7 @@ def _write(config: DictConfig, output: Path, layer: SomaLayer, identity: Identit
             )
             for frame, vertices in result.vertices.items()
         ]
-        contact_sheet(output / "contact_sheet.png", bodies, width=config.picture.width)
+        contact_sheet(output / "contact_sheet.png", bodies, width=options.picture.width)
     _log.info("wrote %s", ", ".join(sorted(products)) or "nothing")
 
 

@@ -11,15 +11,15 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 
 from soma_core.backends.rest_shape import ComposedRestShape
 from soma_core.cache import atomic_write
 from soma_core.errors import SomaError
 from soma_core.evaluation.random_poses import random_axis_angles
 from soma_core.layer import SomaLayer
+from soma_core.options import BackendChoice
 from soma_core.shape_space.sampling import sample_parameters
-from soma_core.tasks.animate import given_params
 
 __all__ = ["run"]
 
@@ -36,10 +36,10 @@ def run(config: DictConfig, output: Path) -> None:
         SomaError: the timed path and the reference disagree; nothing is timed then.
     """
     torch.set_num_threads(config.threads)
-    backend = config.backend
+    backend: BackendChoice = OmegaConf.to_object(config.backend)
     begin = time.perf_counter()
     layer = SomaLayer(
-        backend.name, options=given_params(backend.options), kernels=str(config.kernels), device=config.device
+        backend.name, options=backend.options, kernels=str(config.kernels), device=config.device
     )
     construction = time.perf_counter() - begin
     _check(config, layer)

@@ -56,8 +56,8 @@ def _draw(path: Path, report: Report) -> None:
     """Draw the bodies of a report, if it has any; without pyvista there is no picture, and that is said."""
     if not report.bodies:
         return
-    from soma_core.tasks.error_picture import error_sheet
-    from soma_core.tasks.stage import Body
+    from soma_core.view.error_picture import error_sheet
+    from soma_core.view.stage import Body
 
     bodies = [
         Body(vertices=body.vertices, triangles=body.triangles, colour=(0.8, 0.8, 0.8), caption=body.caption)

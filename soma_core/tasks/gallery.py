@@ -11,17 +11,16 @@ import numpy as np
 import torch
 
 from soma_core.errors import SomaError
-from soma_core.layer import SomaLayer
+from soma_core.motion.animated import animate, load_clip
+from soma_core.motion.models import open_layer
 from soma_core.plugin.errors import BackendError
 from soma_core.plugin.registry import default_registry
 from soma_core.shape_space.sampling import sample_parameters
-from soma_core.tasks.animate import animate, load_motion
-from soma_core.tasks.picture import backend_colour, gallery
-from soma_core.tasks.stage import Body
+from soma_core.view.picture import backend_colour, gallery
+from soma_core.view.stage import Body
 
 if TYPE_CHECKING:
-    from omegaconf import DictConfig
-
+    from soma_core.config.schema import AnimateConfig
     from soma_core.io.motion import Motion
     from soma_core.plugin.spec import BackendSpec
 
@@ -43,7 +42,7 @@ _POSE_SECOND = 10.75
 """Second of the shipped clip that shows a pose with depth: a lifted knee, the arms swinging."""
 
 
-def draw_gallery(config: DictConfig, path: Path) -> None:
+def draw_gallery(options: AnimateConfig, path: Path) -> None:
     """Write one picture with identities of every usable backend in the same pose.
 
     A backend that does not build is reported and left out.
@@ -51,18 +50,18 @@ def draw_gallery(config: DictConfig, path: Path) -> None:
     Raises:
         SomaError: no backend is usable, or pyvista is not installed.
     """
-    motion = load_motion(config)
-    frame = motion.frame_count // 2 if config.motion else round(_POSE_SECOND * motion.fps)
+    motion = load_clip(options.motion, fps=options.motion_fps, frames=options.frames)
+    frame = motion.frame_count // 2 if options.motion else round(_POSE_SECOND * motion.fps)
     pose = _one_frame(motion, min(frame, motion.frame_count - 1))
     bodies = []
     for name in default_registry().names():
         try:
-            bodies += _bodies(name, config, pose)
+            bodies += _bodies(name, options, pose)
         except BackendError as error:
             _log.warning("%s", error)
     if not bodies:
         raise SomaError("no backend is usable. Run: soma backends")
-    gallery(path, bodies, width=config.picture.width)
+    gallery(path, bodies, width=options.picture.width)
     _log.info("wrote %d bodies", len(bodies))
 
 
@@ -84,17 +83,10 @@ def _random_parameters(spec: BackendSpec, count: int, random: np.random.Generato
     return drawn
 
 
-def _bodies(name: str, config: DictConfig, pose: Motion) -> list[Body]:
+def _bodies(name: str, options: AnimateConfig, pose: Motion) -> list[Body]:
     """The default identity of a backend, then random ones, posed and standing on the floor."""
-    layer = SomaLayer(
-        name,
-        lod=str(config.lod),
-        device=config.device,
-        kernels=str(config.kernels),
-        procedural=config.procedural,
-        correctives=config.correctives,
-    )
-    generator = np.random.default_rng(config.seed)
+    layer = open_layer(options, name, {})
+    generator = np.random.default_rng(options.seed)
     random = _random_parameters(layer.spec, _IDENTITIES - 1, generator)
     choices = [{}, *({key: rows[i] for key, rows in random.items()} for i in range(_IDENTITIES - 1))]
     found = []

@@ -4,37 +4,30 @@ from __future__ import annotations
 
 import json
 import logging
-import shutil
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
+from omegaconf import OmegaConf
 
-from soma_core.cache import atomic_write
 from soma_core.errors import AssetError, InputError
-from soma_core.io.mesh_vertices import read_mesh_vertices
-from soma_core.obj import read_obj
+from soma_core.options import BackendChoice
 from soma_core.plugin.registry import default_registry
 from soma_core.plugin.spec import WrapPair
+from soma_core.registration.native_mesh import NativeMesh, neutral_mesh, read_native_mesh
+from soma_core.registration.pair_files import write_pair, write_report
 from soma_core.registration.quality import Quality, measure
 from soma_core.registration.register import Registration, WrapOptions, register
 from soma_core.rig import load_canonical
-from soma_core.rig.mesh import CanonicalMesh
-from soma_core.tasks.animate import given_params
-from soma_core.tasks.neutral_mesh import NativeMesh, neutral_mesh
 
 if TYPE_CHECKING:
     from omegaconf import DictConfig
 
-__all__ = ["WRAP_FILE", "run", "write_pair", "write_report"]
+__all__ = ["run"]
 
 _log = logging.getLogger(__name__)
 
-WRAP_FILE = "SOMA_wrap.obj"
 _AXES = ("+x", "-x", "+y", "-y", "+z", "-z")
-_DIGITS = {"m": 7, "cm": 5, "mm": 4}
-"""Decimals of a coordinate: a tenth of a micrometre."""
 
 
 def run(config: DictConfig, output: Path) -> None:
@@ -53,20 +46,9 @@ def run(config: DictConfig, output: Path) -> None:
     write_report(folder, found, quality, native=pair.native.name)
     _say(found, quality, pair, config.fill)
     if config.picture:
-        from soma_core.tasks.wrap_picture import draw_wrap
+        from soma_core.view.wrap_picture import draw_wrap
 
         draw_wrap(folder / "wrap.png", found, quality, mesh)
-
-
-def write_report(folder: Path, found: Registration, quality: Quality, *, native: str) -> None:
-    """Write ``report.json``: what was found, and how good the wrap is; `native` is the file of the mesh."""
-    report = {
-        "native": native, "pair": [native, WRAP_FILE],
-        "unit": found.frame.unit, "up": found.frame.up, "forward": found.frame.forward,
-        "symmetric": found.symmetric, "notes": list(found.notes), **quality.as_dict(),
-    }  # fmt: skip
-    text = json.dumps(report, indent=2) + "\n"
-    atomic_write(folder / "report.json", lambda path: _write_text(path, text))
 
 
 def _say(found: Registration, quality: Quality, pair: WrapPair, fill: Sequence[str]) -> None:
@@ -100,26 +82,9 @@ def _read_native(config: DictConfig) -> NativeMesh:
             fix="Pass native=BODY.obj or backend=NAME.",
         )
     if chosen:
-        options, params = given_params(config.backend.options), given_params(config.backend.params)
-        return neutral_mesh(default_registry(), config.backend.name, options=options, params=params)
-    path = Path(config.native).expanduser()
-    if path.suffix.lower() == ".obj":
-        return NativeMesh(vertices=(read := read_obj(path))[0], triangles=read[1], name=path.name, file=path)
-    if path.suffix.lower() != ".ply":
-        raise InputError(
-            "native", got=f"the suffix {path.suffix!r}", expected=".obj or .ply", fix="Export it as OBJ."
-        )
-    vertices = read_mesh_vertices(path)
-    return NativeMesh(vertices=vertices, triangles=_ply_triangles(path, vertices), name=f"{path.stem}.obj")
-
-
-def _ply_triangles(path: Path, vertices: np.ndarray) -> np.ndarray:
-    import trimesh
-
-    loaded = trimesh.load(path, process=False, maintain_order=True)
-    if not isinstance(loaded, trimesh.Trimesh) or len(loaded.vertices) != len(vertices):
-        raise AssetError(path, cause="holds no faces", fix="Export the mesh with its faces, as OBJ.")
-    return np.asarray(loaded.faces, np.int64)
+        backend: BackendChoice = OmegaConf.to_object(config.backend)
+        return neutral_mesh(default_registry(), backend.name, options=backend.options, params=backend.params)
+    return read_native_mesh(Path(config.native).expanduser())
 
 
 def _options(config: DictConfig, native: NativeMesh) -> WrapOptions:
@@ -159,64 +124,3 @@ def _json(name: str | None, kind: type, expected: str) -> Any:
     if not whole:
         raise AssetError(path, cause=f"does not hold {expected}", fix="Write it as JSON.")
     return content
-
-
-def write_pair(
-    folder: Path,
-    found: Registration,
-    mesh: CanonicalMesh,
-    *,
-    vertices: np.ndarray,
-    triangles: np.ndarray,
-    name: str,
-    source: Path | None = None,
-) -> WrapPair:
-    """Write ``SOMA_wrap.obj`` and the native mesh, and return the pair for a backend's declaration.
-
-    Args:
-        folder: made where it is missing.
-        found: the registration.
-        mesh: the canonical mesh, whose polygons and UVs go into the file.
-        vertices, triangles: the native mesh, all of it and in its order.
-        name: file name of the native mesh.
-        source: an OBJ to copy as it is, instead of writing the arrays.
-    """
-    if name == WRAP_FILE:
-        name = f"native_{name}"
-    digits = _DIGITS[found.frame.unit]
-    native, wrap = folder / name, folder / WRAP_FILE
-    if source is not None:
-        if not (native.exists() and native.samefile(source)):
-            atomic_write(native, lambda path: _copy(source, path))
-    else:
-        atomic_write(native, lambda path: _write_obj(path, vertices, triangles + 1, digits + 2))
-    faces = _canonical_faces(mesh)
-    atomic_write(wrap, lambda path: _write_obj(path, found.wrap, faces, digits, uv=mesh.uv))
-    return WrapPair(native=native, wrap=wrap)
-
-
-def _canonical_faces(mesh: CanonicalMesh) -> list[list[str]]:
-    """Corners of each polygon as they stand in an OBJ, vertex/UV, counted from 1."""
-    ids = mesh.face_vert_indices + 1
-    corners = [f"{v}/{t + 1}" for v, t in zip(ids, mesh.uv_indices, strict=True)] if len(mesh.uv) else [
-        str(v) for v in ids
-    ]  # fmt: skip
-    ends = np.cumsum(mesh.face_vert_counts)
-    return [corners[end - count : end] for end, count in zip(ends, mesh.face_vert_counts, strict=True)]
-
-
-def _write_obj(
-    path: Path, vertices: np.ndarray, faces: Any, digits: int, *, uv: np.ndarray | None = None
-) -> None:
-    lines = [f"v {x:.{digits}f} {y:.{digits}f} {z:.{digits}f}" for x, y, z in vertices.tolist()]
-    lines += [] if uv is None else [f"vt {u:.6f} {v:.6f}" for u, v in uv.tolist()]
-    lines += ["f " + " ".join(map(str, face)) for face in faces]
-    _write_text(path, "\n".join(lines) + "\n")
-
-
-def _write_text(path: Path, text: str) -> None:
-    path.write_text(text, encoding="utf-8")
-
-
-def _copy(source: Path, path: Path) -> None:
-    shutil.copyfile(source, path)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import fields
+
 import pytest
 from hydra import compose, initialize
 from omegaconf import OmegaConf
@@ -9,6 +11,7 @@ from omegaconf import OmegaConf
 from soma_core.cli import TASKS
 from soma_core.config.schema import register_schemas
 from soma_core.config.searchpath import register_search_path
+from soma_core.options import ModelOptions
 from soma_core.plugin.registry import default_registry
 
 
@@ -24,6 +27,15 @@ def test_each_task_composes_and_states_every_key_of_its_schema(task: str) -> Non
         config = compose(task)
     assert OmegaConf.missing_keys(config) == set()
     assert OmegaConf.get_type(config) is not dict
+
+
+@pytest.mark.parametrize("task", ["animate", "invert", "convert"])
+def test_commands_share_the_options_of_a_model(task: str) -> None:
+    shared = {field.name: getattr(ModelOptions(), field.name) for field in fields(ModelOptions)}
+    with initialize(config_path=None, version_base="1.3"):
+        config = OmegaConf.to_object(compose(task, overrides=["++out=here"] if task == "convert" else []))
+    assert isinstance(config, ModelOptions)
+    assert {name: getattr(config, name) for name in shared} == shared
 
 
 def test_each_backend_config_lists_exactly_the_declared_parameters() -> None:

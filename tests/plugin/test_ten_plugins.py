@@ -11,11 +11,11 @@ import pytest
 
 from soma_core.io.motion import Motion
 from soma_core.layer import SomaLayer
+from soma_core.motion import animate
 from soma_core.plugin.discovery import find_offers
 from soma_core.plugin.errors import BackendError
 from soma_core.plugin.listing import entries_json, entries_text
 from soma_core.plugin.registry import Registry
-from soma_core.tasks.animate import animate
 from soma_core.tasks.backends import load_all
 from soma_core.testing.synthetic import synthetic_canonical, write_wrap_pair
 from tests.plugin.installed import Distribution

@@ -12,6 +12,8 @@ from soma_core.config.schema import AnimateConfig
 from soma_core.errors import InputError
 from soma_core.io import read_motion, write_motion
 from soma_core.layer import SomaLayer
+from soma_core.motion import animate, animated, load_clip
+from soma_core.options import FrameRange
 from soma_core.tasks import animate as task
 
 GROUND_TOLERANCE = 1e-5
@@ -40,7 +42,7 @@ def identity(layer):
 
 @pytest.fixture
 def motion():
-    return task.load_motion(configured())
+    return load_clip(frames=FrameRange(start=0, stop=60, step=20))
 
 
 def lowest(result):
@@ -96,7 +98,7 @@ def test_gallery_of_all_backends(tmp_path, monkeypatch):
 def test_ground_puts_the_lowest_vertex_on_the_floor(layer, identity, motion):
     lifted = replace(motion, translation=motion.translation + UP)
     for mode in ("ground", "none"):
-        result = task.animate(layer, identity, lifted, translation=mode, keep=list(range(3)))
+        result = animate(layer, identity, lifted, translation=mode, keep=list(range(3)))
         assert abs(lowest(result)) < GROUND_TOLERANCE
         np.testing.assert_array_equal(result.transforms[:, 0], np.tile(np.eye(4), (3, 1, 1)))
         np.testing.assert_allclose(
@@ -106,15 +108,13 @@ def test_ground_puts_the_lowest_vertex_on_the_floor(layer, identity, motion):
 
 def test_motion_is_taken_as_recorded(layer, identity, motion):
     lifted = replace(motion, translation=motion.translation + UP)
-    result = task.animate(layer, identity, lifted, translation="motion", keep=[0])
+    result = animate(layer, identity, lifted, translation="motion", keep=[0])
     np.testing.assert_array_equal(result.motion.translation, lifted.translation)
     assert lowest(result) > 2
 
 
 def test_none_keeps_the_hips_where_they_are(layer, identity, motion):
-    result = task.animate(
-        layer, identity, replace(motion, translation=motion.translation * 7), translation="none"
-    )
+    result = animate(layer, identity, replace(motion, translation=motion.translation * 7), translation="none")
     assert np.ptp(result.motion.translation, axis=0).max() == 0
 
 
@@ -123,16 +123,16 @@ def test_a_small_body_takes_small_steps(layer, identity, motion):
     bind[..., :3, 3] /= 2
     half = replace(identity, rest=identity.rest / 2, bind_world=bind)
     walk = replace(motion, translation=motion.translation + np.arange(3)[:, None] * [0.0, 0.0, 1.0])
-    whole = task.animate(layer, identity, walk).motion.translation
-    short = task.animate(layer, half, walk).motion.translation
+    whole = animate(layer, identity, walk).motion.translation
+    short = animate(layer, half, walk).motion.translation
     np.testing.assert_allclose(np.diff(short, axis=0), np.diff(whole, axis=0) / 2, atol=1e-5)
 
 
 def test_chunks_do_not_show(layer, identity, monkeypatch):
-    motion = task.load_motion(configured(frames={"step": 60}))
-    whole = task.animate(layer, identity, motion, keep=[0, 5])
-    monkeypatch.setattr(task, "_CHUNK", 3)
-    parts = task.animate(layer, identity, motion, keep=[0, 5])
+    motion = load_clip(frames=FrameRange(step=60))
+    whole = animate(layer, identity, motion, keep=[0, 5])
+    monkeypatch.setattr(animated, "_CHUNK", 3)
+    parts = animate(layer, identity, motion, keep=[0, 5])
     np.testing.assert_allclose(parts.transforms, whole.transforms, atol=GROUND_TOLERANCE)
     np.testing.assert_allclose(parts.vertices[5], whole.vertices[5], atol=GROUND_TOLERANCE)
 
@@ -142,28 +142,28 @@ def test_absolute_rotations_give_the_same_body(layer, identity, motion):
     relative = motion.rotations.astype(float)
     local = np.swapaxes(orient[layer.rig.parents[1:]], -1, -2) @ relative @ orient[1:]
     absolute = replace(motion, rotations=local, convention="absolute_local")
-    a = task.animate(layer, identity, motion, keep=[2]).vertices[2]
-    b = task.animate(layer, identity, absolute, keep=[2]).vertices[2]
+    a = animate(layer, identity, motion, keep=[2]).vertices[2]
+    b = animate(layer, identity, absolute, keep=[2]).vertices[2]
     np.testing.assert_allclose(a, b, atol=GROUND_TOLERANCE)
 
 
 def test_another_rig(layer, identity, motion):
     foreign = replace(motion, rig_revision="f" * 16)
-    assert task.animate(layer, identity, foreign).motion.rig_revision == layer.rig.revision
+    assert animate(layer, identity, foreign).motion.rig_revision == layer.rig.revision
     with pytest.raises(InputError, match=r"rig_revision: got ffffffffffffffff"):
-        task.animate(layer, identity, replace(foreign, convention="absolute_local"))
+        animate(layer, identity, replace(foreign, convention="absolute_local"))
 
 
 def test_frames_outside_the_motion_are_refused():
     with pytest.raises(InputError, match=r"frames: got start=5000.*inside the 421 frames"):
-        task.load_motion(configured(frames={"start": 5000}))
+        load_clip(frames=FrameRange(start=5000))
     with pytest.raises(InputError, match=r"frames: got start=0, stop=None, step=0"):
-        task.load_motion(configured(frames={"step": 0}))
+        load_clip(frames=FrameRange(step=0))
 
 
 def test_unknown_translation_is_refused(layer, identity, motion):
     with pytest.raises(InputError, match=r"translation: got 'sideways'"):
-        task.animate(layer, identity, motion, translation="sideways")
+        animate(layer, identity, motion, translation="sideways")
 
 
 def test_a_motion_is_found_from_the_current_folder(motion, tmp_path, monkeypatch):
@@ -172,13 +172,8 @@ def test_a_motion_is_found_from_the_current_folder(motion, tmp_path, monkeypatch
     rotations[:, 0] = turned @ rotations[:, 0]
     write_motion(replace(motion, rotations=rotations), tmp_path / "turned.npz")
     monkeypatch.chdir(tmp_path)
-    found = task.load_motion(configured(motion="turned.npz", frames={"start": 1, "stop": 2}))
+    found = load_clip("turned.npz", frames=FrameRange(start=1, stop=2))
     np.testing.assert_array_equal(found.rotations, rotations[1:2])
-
-
-def test_null_parameters_take_their_default():
-    values = OmegaConf.create({"age": None, "weight": 0.3, "shape": [1, 2]})
-    assert task.given_params(values) == {"weight": 0.3, "shape": [1, 2]}
 
 
 def test_the_extra_low_mesh_is_written_with_its_own_faces_and_texture(tmp_path):

@@ -6,12 +6,16 @@ import json
 
 import numpy as np
 import pytest
+from omegaconf import OmegaConf
 
 from soma_core.cli import EXIT_FAILED, EXIT_OK, main
+from soma_core.config.schema import ConvertConfig
 from soma_core.errors import InputError
 from soma_core.io import read_motion, write_motion
+from soma_core.motion import conversion, convert_folder
+from soma_core.motion.files import ResultFiles
 from soma_core.tasks import convert
-from tests.tasks.test_convert_file import configured, motion
+from tests.motion.test_converter import motion
 
 
 @pytest.fixture
@@ -27,6 +31,11 @@ def folder(tmp_path, amass):
     (root / ".hidden.npz").write_bytes(b"x")
     (root / "note.txt").write_text("x")
     return root
+
+
+def run(source, output):
+    config = OmegaConf.structured(ConvertConfig)
+    convert.run(OmegaConf.merge(config, {"input": str(source), "out": str(output)}), output)
 
 
 def files_of(folder):
@@ -72,13 +81,13 @@ def test_results_inside_the_input_are_not_converted_again(folder, tmp_path):
     for name in ("cut.npz", "CMU/01/walk_poses.npz"):
         (folder / name).unlink()
     for _ in range(2):
-        convert.run(configured(input=str(folder)), folder / "made")
+        convert_folder(folder, folder / "made")
     rows = json.loads((folder / "made/report.json").read_text())["files"]
     assert sorted(rows) == ["CMU/01/shape.npz", "k.npz", "ours.npz"]
 
 
 def test_files_of_one_name_and_two_suffixes_stay_apart(tmp_path):
-    made = [convert._mirrored(tmp_path, name) for name in ("a/b.npz", "a/b.parquet")]
+    made = [ResultFiles.mirrored(tmp_path, name) for name in ("a/b.npz", "a/b.parquet")]
     assert made[0].motion == tmp_path / "motions/a/b.npz"
     assert made[1].motion == tmp_path / "motions/a/b.parquet.npz"
     assert made[0].report != made[1].report
@@ -96,7 +105,7 @@ def test_a_folder_without_a_motion_is_refused(tmp_path, content, said):
     for name, keys in content.items():
         np.savez(tmp_path / name, **keys)
     with pytest.raises(InputError, match=said):
-        convert.run(configured(input=str(tmp_path)), tmp_path / "out")
+        run(tmp_path, tmp_path / "out")
 
 
 @pytest.mark.parametrize(
@@ -137,8 +146,8 @@ def test_a_stopped_run_says_how_to_go_on(tmp_path, monkeypatch, caplog):
     def stop(*_):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(convert.Converter, "__call__", stop)
+    monkeypatch.setattr(conversion.Converter, "__call__", stop)
     write_motion(motion(), tmp_path / "m.npz")
     with pytest.raises(KeyboardInterrupt):
-        convert.run(configured(input=str(tmp_path / "m.npz")), tmp_path / "out")
+        run(tmp_path / "m.npz", tmp_path / "out")
     assert f"stopped; the same command with out={tmp_path / 'out'} goes on from here" in caplog.text

@@ -11,7 +11,8 @@ from soma_core.errors import InputError, SomaError
 from soma_core.evaluation.random_poses import joint_spread, random_axis_angles
 from soma_core.evaluation.report import Figure, Report, ShownBody, distance_figures
 from soma_core.rig import load_canonical
-from soma_core.tasks import error_picture, evaluate
+from soma_core.tasks import evaluate
+from soma_core.view import error_picture
 
 
 def configured(name, count=2):

@@ -14,10 +14,12 @@ from soma_core.cli import EXIT_OK, main
 from soma_core.errors import InputError
 from soma_core.io import read_motion
 from soma_core.layer import SomaLayer
+from soma_core.motion import animate, identities, models, stored_identity
 from soma_core.plugin.hookspecs import hookimpl
 from soma_core.plugin.registry import Registry
 from soma_core.plugin.spec import Parameter
-from soma_core.tasks import animate, found_identity, invert
+from soma_core.tasks import animate as animate_task
+from soma_core.tasks import invert
 from tests.bodies import randn
 from tests.plugin.fakes import FakeEntryPoint
 from tests.tasks import test_animate
@@ -64,12 +66,12 @@ def animated(folder, frames):
         motion=str(folder / "motion.npz"), identity_from="motion", translation="motion", write=["npz"],
         frames={"start": 0, "stop": None, "step": 1},
     )  # fmt: skip
-    animate.run(config, folder / "again")
+    animate_task.run(config, folder / "again")
     motion = read_motion(folder / "again/motion.npz")
     layer = SomaLayer(motion.identity["backend"], lod="low", procedural=False)
     with torch.no_grad():
-        body = animate.stored_identity(layer, motion.identity)
-        result = animate.animate(layer, body, motion, translation="motion", keep=list(range(frames)))
+        body = stored_identity(layer, motion.identity)
+        result = animate(layer, body, motion, translation="motion", keep=list(range(frames)))
     return np.stack(list(result.vertices.values()))
 
 
@@ -100,11 +102,11 @@ def test_an_unposed_body_travels_as_its_rest_shape(source, tmp_path):
 
 
 def test_a_run_that_goes_on_keeps_the_body_that_it_found(source, tmp_path, monkeypatch):
-    monkeypatch.setattr(invert, "PoseInversion", Stopping)
+    monkeypatch.setattr(models, "PoseInversion", Stopping)
     monkeypatch.setattr(Stopping, "calls", 1)
     with pytest.raises(KeyboardInterrupt):
         invert.run(settings(source), tmp_path / "fit")
-    monkeypatch.setattr(found_identity, "fit_identity", lambda *_, **__: pytest.fail("searched again"))
+    monkeypatch.setattr(identities, "fit_identity", lambda *_, **__: pytest.fail("searched again"))
     with pytest.raises(InputError, match="identity: got .*'frames': 5.*, expected .*'frames': 4"):
         invert.run(settings(source, frames=5), tmp_path / "fit")
     invert.run(settings(source), tmp_path / "fit")
@@ -127,4 +129,4 @@ def test_from_the_command_line(source, tmp_path, monkeypatch, capsys):
 
 def test_a_motion_without_an_identity_cannot_give_one():
     with pytest.raises(InputError, match="identity_from: got a motion with nothing of its"):
-        animate.run(test_animate.configured(identity_from="motion", motion=None), None)
+        animate_task.run(test_animate.configured(identity_from="motion", motion=None), None)

@@ -14,9 +14,12 @@ from soma_core.config.schema import InvertConfig
 from soma_core.errors import InputError, SomaError
 from soma_core.io import open_vertex_sequence, read_motion
 from soma_core.layer import SomaLayer
-from soma_core.tasks import animate, convert_file, invert
-from soma_core.tasks.fit_results import worst_frames
-from soma_core.tasks.fitted_chunks import FittedChunks
+from soma_core.motion import animate, converter, load_clip, models
+from soma_core.motion.chunks import FittedChunks
+from soma_core.motion.fit_results import worst_frames
+from soma_core.options import FrameRange
+from soma_core.tasks import animate as animate_task
+from soma_core.tasks import invert
 
 ROUND_TRIP_MM = 0.1
 """Largest distance between the input and what soma animate makes of the fitted motion."""
@@ -46,10 +49,7 @@ def layer():
 @pytest.fixture(scope="module")
 def vertices(layer):
     """Eight frames of the shipped clip, spread over it, on a body that is not the default."""
-    clip = OmegaConf.create(
-        {"motion": None, "motion_fps": None, "frames": {"start": 0, "stop": 440, "step": 55}}
-    )
-    motion = animate.load_motion(clip)
+    motion = load_clip(frames=FrameRange(stop=440, step=55))
     identity = layer.identity({"shape": [1.0, -0.5]})
     with torch.no_grad():
         posed = layer.pose(identity, torch.as_tensor(motion.rotations), torch.as_tensor(motion.translation))
@@ -87,7 +87,7 @@ def test_invert_then_animate_reproduces_the_input(layer, vertices, source, tmp_p
     assert motion.identity == {"backend": "soma", "params": {"shape": [1.0, -0.5]}}
     identity = layer.identity(motion.identity["params"])
     with torch.no_grad():
-        found = animate.animate(layer, identity, motion, translation="motion", keep=list(range(FRAMES)))
+        found = animate(layer, identity, motion, translation="motion", keep=list(range(FRAMES)))
     for frame, expected in enumerate(vertices):
         assert 1e3 * np.abs(found.vertices[frame] - expected).max() < ROUND_TRIP_MM
 
@@ -131,7 +131,7 @@ def test_twist_and_correctives_are_fitted_unless_told_otherwise(layer, source, t
 def test_our_own_files_go_round(layer, tmp_path):
     from tests.tasks.test_animate import configured as animation
 
-    animate.run(animation(write=["npz", "usd", "glb"], procedural=False), tmp_path / "made")
+    animate_task.run(animation(write=["npz", "usd", "glb"], procedural=False), tmp_path / "made")
     expected = read_motion(tmp_path / "made/motion.npz")
     for name in ("body.usdc", "body.glb"):
         path = tmp_path / "made" / name
@@ -152,7 +152,7 @@ def test_chunks_give_what_the_whole_gives(layer, source, tmp_path):
     assert not (tmp_path / "parts/chunks").exists()
 
 
-class Stopping(invert.PoseInversion):
+class Stopping(models.PoseInversion):
     """Stops the run at the third chunk, and counts."""
 
     calls = 0
@@ -168,7 +168,7 @@ def test_a_stopped_run_goes_on_after_the_chunks_that_it_finished(source, tmp_pat
     caplog.set_level("INFO")
     config = configured(input=str(source), chunk=2)
     invert.run(config, tmp_path / "whole")
-    monkeypatch.setattr(invert, "PoseInversion", Stopping)
+    monkeypatch.setattr(models, "PoseInversion", Stopping)
     monkeypatch.setattr(Stopping, "calls", 0)
     with pytest.raises(KeyboardInterrupt):
         invert.run(config, tmp_path / "fit")
@@ -186,7 +186,7 @@ def test_a_stopped_run_goes_on_after_the_chunks_that_it_finished(source, tmp_pat
 
 
 def test_chunks_of_another_configuration_are_refused(source, tmp_path, monkeypatch):
-    monkeypatch.setattr(invert, "PoseInversion", Stopping)
+    monkeypatch.setattr(models, "PoseInversion", Stopping)
     monkeypatch.setattr(Stopping, "calls", 1)
     with pytest.raises(KeyboardInterrupt):
         invert.run(configured(input=str(source), chunk=2), tmp_path / "fit")
@@ -312,8 +312,7 @@ def test_the_papers_methods_run_from_the_command_line(source, tmp_path, monkeypa
 
 def other_body(layer):
     """The same poses on somebody else."""
-    clip = {"motion": None, "motion_fps": None, "frames": {"start": 0, "stop": 440, "step": 55}}
-    motion = animate.load_motion(OmegaConf.create(clip))
+    motion = load_clip(frames=FrameRange(stop=440, step=55))
     turns, hips = torch.as_tensor(motion.rotations), torch.as_tensor(motion.translation)
     with torch.no_grad():
         return layer.pose(layer.identity({"shape": [-2.0, 1.0]}), turns, hips).vertices.numpy()
@@ -404,7 +403,7 @@ def test_an_upside_down_body_is_a_warning_that_names_the_axis(vertices, tmp_path
 def test_a_downward_y_axis_is_turned_as_a_camera_sees(layer, vertices):
     """-Y up is +Y up, turned by half a turn about x."""
     from soma_core.io.vertex_sequence import VertexSequence
-    from soma_core.tasks.posed_input import PosedInput
+    from soma_core.motion.posed_input import PosedInput
 
     class Held(VertexSequence):
         def _read(self, start, stop):
@@ -423,9 +422,9 @@ def test_a_conversion_that_is_no_fit_stays_one(tmp_path):
     """An earlier run's report says so again; where a body lies is told by who reads the file."""
     told = {"cause": "person", "sentence": "the body is another's", "failed": True, "frame": None}
     with pytest.raises(SomaError, match=r"clip\.npz: the body is another's; .*report\.json has the figures"):
-        convert_file._refuse_failed(Path("clip.npz"), {"diagnosis": told}, tmp_path / "report.json")
+        converter._refuse_failed(Path("clip.npz"), {"diagnosis": told}, tmp_path / "report.json")
     for found in (None, told | {"cause": "axis", "failed": False}):
-        convert_file._refuse_failed(Path("clip.npz"), {"diagnosis": found}, tmp_path / "report.json")
+        converter._refuse_failed(Path("clip.npz"), {"diagnosis": found}, tmp_path / "report.json")
 
 
 @pytest.mark.parametrize(

@@ -17,6 +17,7 @@ from soma_core.obj import read_obj
 from soma_core.plugin.hookspecs import hookimpl
 from soma_core.plugin.registry import Registry
 from soma_core.plugin.spec import Parameter, WrapPair
+from soma_core.registration.pair_files import WRAP_FILE
 from soma_core.registration.register import Registration, WrapOptions
 from soma_core.registration.target import Frame, Skin
 from soma_core.rig import load_canonical
@@ -77,9 +78,9 @@ def test_the_pair_is_ready_for_a_plugin(
     wrap.run(configured(native=str(body), out=str(tmp_path / "pair")), tmp_path / "run")
     folder = tmp_path / "pair"
     assert (folder / "body.obj").read_bytes() == body.read_bytes()
-    vertices, _ = read_obj(folder / wrap.WRAP_FILE)
+    vertices, _ = read_obj(folder / WRAP_FILE)
     assert 1000 * np.abs(vertices - mesh.vertices).max() < ROUNDING_MM
-    pair = WrapPair(native=folder / "body.obj", wrap=folder / wrap.WRAP_FILE)
+    pair = WrapPair(native=folder / "body.obj", wrap=folder / WRAP_FILE)
     found = load_correspondence(pair, mesh)
     assert 1000 * found.distances.max() < ROUNDING_MM
     report = json.loads((folder / "report.json").read_text(encoding="utf-8"))
@@ -91,7 +92,7 @@ def test_the_pair_is_ready_for_a_plugin(
 
 def test_the_wrap_carries_the_uvs(tmp_path: Path, body: Path, mesh: CanonicalMesh, seen) -> None:
     wrap.run(configured(native=str(body)), tmp_path)
-    lines = (tmp_path / wrap.WRAP_FILE).read_text(encoding="utf-8").splitlines()
+    lines = (tmp_path / WRAP_FILE).read_text(encoding="utf-8").splitlines()
     assert sum(line.startswith("vt ") for line in lines) == len(mesh.uv)
     faces = [line for line in lines if line.startswith("f ")]
     assert len(faces) == len(mesh.face_vert_counts)
@@ -111,9 +112,9 @@ def test_a_ply_is_read_in_its_order(tmp_path: Path, mesh: CanonicalMesh, seen) -
 
 
 def test_a_mesh_with_the_name_of_the_wrap_keeps_out_of_its_way(tmp_path: Path, body: Path, seen) -> None:
-    native = body.rename(tmp_path / wrap.WRAP_FILE)
+    native = body.rename(tmp_path / WRAP_FILE)
     wrap.run(configured(native=str(native), out=str(tmp_path / "pair")), tmp_path)
-    assert (tmp_path / "pair" / f"native_{wrap.WRAP_FILE}").read_bytes() == native.read_bytes()
+    assert (tmp_path / "pair" / f"native_{WRAP_FILE}").read_bytes() == native.read_bytes()
 
 
 def test_what_the_user_knows_is_passed_on(tmp_path: Path, body: Path, seen: list[WrapOptions]) -> None:

@@ -5,13 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
-from omegaconf import OmegaConf
 
 from soma_core import AssetError, BackendError, InputError, read_motion
-from soma_core.config.schema import ConvertConfig, IdentityMethod
+from soma_core.motion import BackendChoice, ConvertOptions, IdentityChoice, convert_file
 from soma_core.plugin import Registry
-from soma_core.tasks.convert_file import Converter
-from soma_core.tasks.fit_job import ResultFiles
 from tests.standins.mhr_files import StandIn, mhr_body
 
 FIT_MM = 3.0
@@ -39,10 +36,9 @@ def person():
 
 def converted(folder, person, *, trusted=True, **changes):
     np.savez(folder / "person.npz", **person)
-    backend = {"name": "mhr", "options": {"trust": True}, "params": {}} if trusted else None
-    settings = {"lod": "low", "out": "", "fps": 30, "picture": {"frames": 0}, "backend": backend} | changes
-    config = OmegaConf.merge(OmegaConf.structured(ConvertConfig), settings)
-    return Converter(config)(folder / "person.npz", ResultFiles.of_folder(folder / "out"), folder / "chunks")
+    backend = BackendChoice(name="mhr", options={"trust": True}) if trusted else None
+    options = ConvertOptions(**{"lod": "low", "fps": 30, "backend": backend} | changes)
+    return convert_file(folder / "person.npz", folder / "out", options=options)
 
 
 def test_the_body_of_the_file_is_posed(data_folder, person, tmp_path):
@@ -65,7 +61,7 @@ def test_a_body_can_be_found_without_the_model(data_folder, person, tmp_path, mo
         InputError, match=r"shape_params: got none, as in the first releases.*identity=unknown"
     ):
         converted(tmp_path, early)
-    search = {"method": IdentityMethod.backend, "frames": 1, "iterations": 1}
+    search = IdentityChoice(method="backend", frames=1, iterations=1)
     found = converted(tmp_path, early, trusted=False, identity=search)
     motion = read_motion(tmp_path / "out/motion.npz")
     assert motion.identity["backend"] == "soma"
@@ -77,10 +73,10 @@ def test_what_is_missing_is_said(data_folder, person, tmp_path, monkeypatch):
     with pytest.raises(InputError, match=r"person\.npz: fps: got none: SAM 3D Body sees pictures.*fps=30"):
         converted(tmp_path, person, fps=None)
     monkeypatch.setenv("SOMA_DATA_DIR", str(tmp_path))
-    monkeypatch.setattr("soma_core.tasks.convert_bodies.default_registry", Registry)
+    monkeypatch.setattr("soma_core.motion.bodies.default_registry", Registry)
     with pytest.raises(
         AssetError, match=r"mhr_neutral\.obj: the wrap of MHR is missing.*native=mhr_neutral\.ply out="
     ):
-        converted(tmp_path, person, trusted=False, identity={"method": IdentityMethod.backend})
+        converted(tmp_path, person, trusted=False, identity=IdentityChoice(method="backend"))
     with pytest.raises(BackendError, match=r"missing.*mhr_model_lod1\.pt.*Or pass identity=unknown"):
         converted(tmp_path, person)

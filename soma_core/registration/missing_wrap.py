@@ -9,11 +9,11 @@ from typing import Any
 
 from soma_core.obj import read_obj
 from soma_core.plugin.registry import Registry, default_registry
+from soma_core.registration.native_mesh import NativeMesh, neutral_mesh
+from soma_core.registration.pair_files import WRAP_FILE, write_pair, write_report
 from soma_core.registration.quality import measure
 from soma_core.registration.register import WrapOptions, register
 from soma_core.rig import load_canonical
-from soma_core.tasks.neutral_mesh import NativeMesh, neutral_mesh
-from soma_core.tasks.wrap import WRAP_FILE, write_pair, write_report
 
 __all__ = ["make_missing_wrap"]
 

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from soma_core.cache import atomic_write
-from soma_core.tasks.stage import AZIMUTH, PAPER, VIEW_ANGLE, Body, camera_axes, open_stage
+from soma_core.view.stage import AZIMUTH, PAPER, VIEW_ANGLE, Body, camera_axes, open_stage
 
 if TYPE_CHECKING:
     from PIL.Image import Image

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from soma_core.cache import atomic_write
+from soma_core.cache import atomic_text, atomic_write
 from soma_core.errors import InputError
 
 __all__ = ["FittedChunks", "refuse_other_settings"]
@@ -37,8 +37,7 @@ class FittedChunks:
         if file.is_file():
             refuse_other_settings(folder, json.loads(file.read_text(encoding="utf-8")), plan)
             return
-        text = json.dumps(plan, indent=2) + "\n"
-        atomic_write(file, lambda path: path.write_text(text, encoding="utf-8") and None)
+        atomic_text(file, json.dumps(plan, indent=2) + "\n")
 
     def missing(self) -> list[int]:
         """Numbers of the chunks that are still to be made."""

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from soma_core.errors import InputError
 from soma_core.io.vertex_sequence import UpAxis, VertexSequence
+from soma_core.options import Topology
 from soma_core.rig import load_canonical
 from soma_core.topology.correspondence import load_correspondence
 from soma_core.topology.frames import METRES, native_to_canonical
@@ -18,8 +19,6 @@ if TYPE_CHECKING:
     from soma_core.skeleton.identity import Identity
 
 __all__ = ["PosedInput"]
-
-Topology = Literal["canonical", "native"]
 
 _FORWARD: dict[str, Axis] = {
     "+y": "+z", "+z": "-y", "-y": "-z", "-z": "+y", "+x": "+z", "-x": "+z",
@@ -45,14 +44,12 @@ class PosedInput:
         InputError: a vertex count that is neither, or both; a unit that the file does not say.
     """
 
-    def __init__(
-        self, sequence: VertexSequence, layer: SomaLayer, *, topology: Literal["auto", "canonical", "native"]
-    ) -> None:
+    def __init__(self, sequence: VertexSequence, layer: SomaLayer, *, topology: Topology | str) -> None:
         self.sequence, self._spec = sequence, layer.spec
         counts = _vertex_counts(layer)
-        found = _told_apart(sequence, layer, counts) if topology == "auto" else topology
+        found = _told_apart(sequence, layer, counts) if topology == "auto" else Topology(topology)
         _check_count(sequence, layer, counts, found)
-        self.topology: Topology = found
+        self.topology = found
         self._kept = slice(None)
         if found == "canonical":
             self._frame = _canonical_frame(sequence)
@@ -154,7 +151,7 @@ def _told_apart(sequence: VertexSequence, layer: SomaLayer, counts: dict[str, in
             expected="topology=canonical or topology=native",
             fix=f"native means the backend's unit and axes: {layer.spec.unit}, {layer.spec.up} up.",
         )
-    return "native" if native and not canonical else "canonical"
+    return Topology.native if native and not canonical else Topology.canonical
 
 
 def _check_count(

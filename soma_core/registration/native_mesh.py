@@ -11,12 +11,13 @@ import numpy as np
 import torch
 
 from soma_core.backends.parameters import batch_parameters
-from soma_core.errors import InputError
+from soma_core.errors import AssetError, InputError
+from soma_core.io.mesh_vertices import read_mesh_vertices
 from soma_core.obj import read_obj
 from soma_core.plugin.registry import Registry
 from soma_core.plugin.spec import HasTriangles
 
-__all__ = ["NativeMesh", "neutral_mesh"]
+__all__ = ["NativeMesh", "neutral_mesh", "read_native_mesh"]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -72,3 +73,29 @@ def neutral_mesh(
         vertices=vertices, triangles=triangles, name=f"{name}_neutral.obj",
         known={"unit": spec.unit, "up": spec.up, "forward": spec.forward},
     )  # fmt: skip
+
+
+def read_native_mesh(path: Path) -> NativeMesh:
+    """The mesh in an OBJ or PLY file, its vertices in their order.
+
+    Raises:
+        AssetError: the file cannot be read, or holds no faces.
+        InputError: another kind of file.
+    """
+    if path.suffix.lower() == ".obj":
+        return NativeMesh(vertices=(read := read_obj(path))[0], triangles=read[1], name=path.name, file=path)
+    if path.suffix.lower() != ".ply":
+        raise InputError(
+            "native", got=f"the suffix {path.suffix!r}", expected=".obj or .ply", fix="Export it as OBJ."
+        )
+    vertices = read_mesh_vertices(path)
+    return NativeMesh(vertices=vertices, triangles=_ply_triangles(path, vertices), name=f"{path.stem}.obj")
+
+
+def _ply_triangles(path: Path, vertices: np.ndarray) -> np.ndarray:
+    import trimesh
+
+    loaded = trimesh.load(path, process=False, maintain_order=True)
+    if not isinstance(loaded, trimesh.Trimesh) or len(loaded.vertices) != len(vertices):
+        raise AssetError(path, cause="holds no faces", fix="Export the mesh with its faces, as OBJ.")
+    return np.asarray(loaded.faces, np.int64)

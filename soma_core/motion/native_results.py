@@ -16,10 +16,10 @@ from soma_core.io.amass import Gender, SmplMotion, SmplName, write_amass
 from soma_core.io.npz_parts import write_npz_parts
 from soma_core.io.soma_npz import METRES_PER_UNIT
 from soma_core.io.vertex_sequence import UpAxis
+from soma_core.motion.chunks import FittedChunks
+from soma_core.motion.files import ResultFiles
+from soma_core.motion.native_errors import NativeErrors
 from soma_core.native import NativeFit, NativeTransfer
-from soma_core.tasks.fit_job import ResultFiles
-from soma_core.tasks.fitted_chunks import FittedChunks
-from soma_core.tasks.native_errors import NativeErrors
 from soma_core.topology.frames import METRES, native_to_canonical
 
 __all__ = ["NativeTarget", "SmplTarget", "VertexTarget"]

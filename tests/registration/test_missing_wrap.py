@@ -18,11 +18,11 @@ from soma_core.plugin.errors import BackendError
 from soma_core.plugin.hookspecs import hookimpl
 from soma_core.plugin.registry import Registry
 from soma_core.plugin.spec import FileNeeded, Parameter, WrapPair
+from soma_core.registration import missing_wrap
+from soma_core.registration.pair_files import WRAP_FILE
 from soma_core.registration.register import Registration
 from soma_core.registration.target import Frame, Skin
 from soma_core.rig import load_canonical
-from soma_core.tasks import missing_wrap
-from soma_core.tasks.wrap import WRAP_FILE
 from tests.plugin.fakes import FakeEntryPoint, declares
 
 KIND = {"device": torch.device("cpu"), "dtype": torch.float32}

@@ -9,10 +9,10 @@ import pytest
 import torch
 
 from soma_core.errors import InputError
-from soma_core.inversion import PoseInversion
+from soma_core.motion.models import FitBackends, HeldSequence, ModelSequence, TransferredSequence
+from soma_core.motion.options import FitOptions
 from soma_core.plugin.errors import BackendError
 from soma_core.plugin.registry import default_registry
-from soma_core.tasks.posed_model import FitBackends, HeldSequence, ModelSequence, TransferredSequence
 from soma_core.topology.frames import native_to_canonical
 
 ROUNDING = 1e-5
@@ -23,7 +23,7 @@ FILE = Path("body.npz")
 
 @pytest.fixture(scope="module")
 def backends():
-    return FitBackends("low", "cpu", PoseInversion)
+    return FitBackends(FitOptions(lod="low"))
 
 
 def test_a_layer_is_made_once(backends):

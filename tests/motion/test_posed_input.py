@@ -8,8 +8,8 @@ import pytest
 from soma_core.errors import InputError
 from soma_core.io import VertexSequence
 from soma_core.layer import SomaLayer
+from soma_core.motion.posed_input import PosedInput
 from soma_core.rig import load_canonical
-from soma_core.tasks.posed_input import PosedInput
 
 LENGTH_TOLERANCE = 1e-6
 """Relative: float32."""

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from soma_core.tasks.picture import contact_sheet
-from soma_core.tasks.stage import PAPER, Body
+from soma_core.view.picture import contact_sheet
+from soma_core.view.stage import PAPER, Body
 
 if TYPE_CHECKING:
     from PIL.Image import Image

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from soma_core.errors import SomaError
-from soma_core.tasks import picture
-from soma_core.tasks.picture import backend_colour, contact_sheet, gallery
-from soma_core.tasks.stage import Body
+from soma_core.view import picture
+from soma_core.view.picture import backend_colour, contact_sheet, gallery
+from soma_core.view.stage import Body
 
 PIL = pytest.importorskip("PIL.Image", reason="pictures need pyvista and Pillow")
 

@@ -1,10 +1,10 @@
-"""Bodies to fit as sequences of vertices: posed by their backend when they are read, or held in memory."""
+"""Backends with their fits, and bodies as sequences of vertices: posed when read, or held in memory."""
 
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -15,8 +15,11 @@ from torch import Tensor
 from soma_core.backends.parameters import batch_parameters
 from soma_core.errors import InputError
 from soma_core.inversion import PoseInversion
+from soma_core.inversion.options import inversion_options
 from soma_core.io.vertex_sequence import UpAxis, VertexSequence
 from soma_core.layer import SomaLayer
+from soma_core.motion.options import FitOptions
+from soma_core.options import ModelOptions
 from soma_core.plugin.registry import default_registry
 from soma_core.plugin.spec import HasPosed
 from soma_core.rig import load_canonical
@@ -24,7 +27,36 @@ from soma_core.topology.correspondence import load_correspondence
 from soma_core.topology.frames import METRES, native_to_canonical
 from soma_core.topology.transfer import make_transfer
 
-__all__ = ["FitBackend", "FitBackends", "HeldSequence", "ModelSequence", "TransferredSequence"]
+__all__ = [
+    "FitBackend",
+    "FitBackends",
+    "HeldSequence",
+    "ModelSequence",
+    "TransferredSequence",
+    "model_settings",
+    "open_layer",
+]
+
+
+def open_layer(model: ModelOptions, name: str, options: Mapping[str, Any]) -> SomaLayer:
+    """The backend `name` with options of its own, as the model options say.
+
+    Raises:
+        BackendError: it is not installed, or a file of its user's is missing.
+    """
+    return SomaLayer(
+        name, options=options, lod=str(model.lod), device=model.device, kernels=str(model.kernels),
+        procedural=model.procedural, correctives=model.correctives,
+    )  # fmt: skip
+
+
+def model_settings(layer: SomaLayer) -> dict[str, Any]:
+    """What decides a body beside its backend, for a report."""
+    correctives = layer.correctives_file
+    return {
+        "lod": layer.mesh.lod, "procedural": layer.procedural,
+        "correctives": correctives and correctives.name, "rig": layer.rig.revision,
+    }  # fmt: skip
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -59,24 +91,26 @@ class FitBackends:
     """Layers with their fits, each made when it is first asked for.
 
     Args:
-        lod, device: of the layers.
-        make_inversion: the fit on a layer.
+        options: the model and the fit.
     """
 
-    def __init__(self, lod: str, device: str, make_inversion: Callable[[SomaLayer], PoseInversion]) -> None:
-        self._lod, self._device, self._make = lod, device, make_inversion
+    def __init__(self, options: FitOptions) -> None:
+        self._options = options
         self._made: dict[tuple[str, str], FitBackend] = {}
 
     def get(self, name: str, options: Mapping[str, Any]) -> FitBackend:
-        """The backend `name` with these options.
+        """The backend `name` with these options of its own.
 
         Raises:
             BackendError: it is not installed, or a file of its user's is missing.
+            InputError: a choice of the fit that is none.
         """
         key = (name, repr(sorted(options.items())))
         if key not in self._made:
-            layer = SomaLayer(name, options=options, lod=self._lod, device=self._device)
-            self._made[key] = FitBackend(layer=layer, inversion=self._make(layer))
+            layer, choice = open_layer(self._options, name, options), asdict(self._options.inversion)
+            kernels = str(choice.pop("kernels"))
+            inversion = PoseInversion(layer, **inversion_options(choice), kernels=kernels)
+            self._made[key] = FitBackend(layer=layer, inversion=inversion)
         return self._made[key]
 
 

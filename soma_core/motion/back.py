@@ -7,31 +7,30 @@ import logging
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from soma_core.cache import atomic_write
+from soma_core.cache import atomic_text
 from soma_core.errors import InputError
 from soma_core.io.amass import SMPL_JOINTS
 from soma_core.io.motion import Motion
 from soma_core.io.motion_files import check_rig
 from soma_core.layer import SomaLayer
+from soma_core.motion.animated import animate
+from soma_core.motion.chunks import FittedChunks
+from soma_core.motion.converter import Converted, earlier_report
+from soma_core.motion.files import ResultFiles, fingerprint, layout_of, read
+from soma_core.motion.identities import stored_identity
+from soma_core.motion.models import model_settings, open_layer
+from soma_core.motion.native_errors import NativeErrors
+from soma_core.motion.native_results import NativeTarget, SmplTarget, VertexTarget
+from soma_core.motion.options import ConvertOptions
 from soma_core.native import NativeFit, NativeTransfer
 from soma_core.progress import progress
 from soma_core.skeleton.identity import Identity
-from soma_core.tasks.animate import animate, given_params
-from soma_core.tasks.convert_file import Converted, earlier_report, layout_of, motion_of
-from soma_core.tasks.fit_job import ResultFiles, fingerprint
-from soma_core.tasks.fitted_chunks import FittedChunks
-from soma_core.tasks.native_errors import NativeErrors
-from soma_core.tasks.native_results import NativeTarget, SmplTarget, VertexTarget
-from soma_core.tasks.stored_identity import stored_identity
-
-if TYPE_CHECKING:
-    from omegaconf import DictConfig
 
 __all__ = ["BackConverter"]
 
@@ -64,11 +63,11 @@ class BackConverter:
     """Converts one motion after another to a backend's model; layers and fits serve all of them.
 
     Args:
-        config: that of ``soma convert``, whose ``to`` names the backend.
+        options: of the conversion, whose ``to`` names the backend.
     """
 
-    def __init__(self, config: DictConfig) -> None:
-        self._config = config
+    def __init__(self, options: ConvertOptions) -> None:
+        self._options = options
         self._layers: dict[str, SomaLayer] = {}
         self._targets: dict[str, NativeFit | NativeTransfer] = {}
 
@@ -83,39 +82,35 @@ class BackConverter:
                 expected="a motion on this skeleton, for the way back",
                 fix="Convert it with to=soma first.",
             )
-        motion = motion_of(path, self._config)
+        motion = read(path, fps=self._options.fps, unit=self._options.unit)
         layer, stored = self._body(path, motion)
         target = self._target(stored)
         settings = {
             "input": str(path.resolve()), "layout": layout, "fps": motion.fps, "body": stored["backend"],
-            "body_params": stored.get("params"), "translation": str(self._config.translation),
-            "lod": layer.mesh.lod, "rig": layer.rig.revision, **target.facts, "content": fingerprint(path),
+            "body_params": stored.get("params"), "translation": str(self._options.translation),
+            **model_settings(layer), **target.facts, "content": fingerprint(path),
         }  # fmt: skip
         vertices = isinstance(target, VertexTarget)
         earlier = earlier_report(files.report, files.vertices if vertices else files.motion, settings)
         if earlier is not None:
-            return Converted(report=earlier, earlier=True, vertices=vertices)
-        kept = FittedChunks(chunks, settings, frame_count=motion.frame_count, size=self._config.chunk)
-        body = _placed(layer, stored_identity(layer, stored), motion, str(self._config.translation))
+            return Converted(report=earlier, files=files, earlier=True, vertices=vertices)
+        kept = FittedChunks(chunks, settings, frame_count=motion.frame_count, size=self._options.chunk)
+        body = _placed(layer, stored_identity(layer, stored), motion, str(self._options.translation))
         if isinstance(target, SmplTarget) and target.params is None:
             target = replace(target, params=_found_params(kept.folder / "params.json", target, body))
             settings["found"] = target.params
         _convert_missing(body, target, kept)
         figures = target.write(kept, files, fps=motion.fps, source=motion.source)
         report = {"settings": settings, **figures}
-        text = json.dumps(report, indent=2, default=float) + "\n"
-        atomic_write(files.report, lambda file: file.write_text(text, encoding="utf-8") and None)
+        atomic_text(files.report, json.dumps(report, indent=2, default=float) + "\n")
         kept.remove()
-        return Converted(report=report, vertices=vertices)
+        return Converted(report=report, files=files, vertices=vertices)
 
     def _body(self, path: Path, motion: Motion) -> tuple[SomaLayer, Mapping[str, Any]]:
         """Whose body moves: that of the configuration, else that of the motion file."""
-        chosen, stored = self._config.backend, motion.identity
+        chosen, stored = self._options.backend, motion.identity
         if chosen is not None:
-            stored = {
-                "backend": chosen.name, "params": given_params(chosen.params),
-                "options": given_params(chosen.options),
-            }  # fmt: skip
+            stored = {"backend": chosen.name, "params": chosen.params, "options": chosen.options}
         elif "params" not in stored and "rest" not in stored:
             raise InputError(
                 "backend",
@@ -126,16 +121,15 @@ class BackConverter:
         name, options = str(stored["backend"]), dict(stored.get("options", {}))
         key = f"{name} {sorted(options.items())}"
         if key not in self._layers:
-            config = self._config
-            self._layers[key] = SomaLayer(name, options=options, lod=str(config.lod), device=config.device)
+            self._layers[key] = open_layer(self._options, name, options)
         return self._layers[key], stored
 
     def _target(self, stored: Mapping[str, Any]) -> NativeTarget:
         """What becomes of the body; in the SMPL family it keeps the parameters that it has there."""
-        config, name = self._config, str(self._config.to)
-        kind = {"lod": str(config.lod), "device": config.device}
-        if str(config.result or _usual_result(name)) == "vertices":
-            _refuse_for_vertices(config)
+        chosen, name = self._options, self._options.to
+        kind = {"lod": str(chosen.lod), "device": chosen.device}
+        if str(chosen.result or _usual_result(name)) == "vertices":
+            _refuse_for_vertices(chosen)
             if name not in self._targets:
                 self._targets[name] = NativeTransfer(name, **kind)
             return VertexTarget(transfer=self._targets[name])
@@ -145,14 +139,14 @@ class BackConverter:
                 fix="Pass result=vertices; in Python, NativeFit gives the poses of other skinned models.",
             )  # fmt: skip
         own = stored if stored["backend"] == name and "rest" not in stored else {}
-        gender = str(config.gender or own.get("options", {}).get("gender", "neutral"))
-        params = {"betas": list(config.betas)} if config.betas is not None else own.get("params")
+        gender = str(chosen.gender or own.get("options", {}).get("gender", "neutral"))
+        params = {"betas": list(chosen.betas)} if chosen.betas is not None else own.get("params")
         if gender not in self._targets:
             self._targets[gender] = NativeFit(name, options={"gender": gender}, **kind)
         fit = self._targets[gender]
         errors = NativeErrors(fit.transfer, kind["lod"])
         return SmplTarget(
-            fit=fit, errors=errors, model=name, gender=gender, up=f"+{config.up or 'z'}", params=params
+            fit=fit, errors=errors, model=name, gender=gender, up=f"+{chosen.up or 'z'}", params=params
         )
 
 
@@ -172,8 +166,7 @@ def _found_params(file: Path, target: SmplTarget, body: _MovingBody) -> dict[str
         spread = np.unique(np.linspace(0, frames - 1, min(_SEARCHED, frames)).round().astype(int))
         _log.info("finding the body from %d frames", len(spread))
         found = target.fit.fit_params(body.posed(spread))
-        text = json.dumps({name: value[0].tolist() for name, value in found.items()})
-        atomic_write(file, lambda path: path.write_text(text, encoding="utf-8") and None)
+        atomic_text(file, json.dumps({name: value[0].tolist() for name, value in found.items()}))
     return dict(json.loads(file.read_text(encoding="utf-8")))
 
 
@@ -188,13 +181,13 @@ def _usual_result(name: str) -> str:
     return "poses" if name in SMPL_JOINTS else "vertices"
 
 
-def _refuse_for_vertices(config: DictConfig) -> None:
+def _refuse_for_vertices(options: ConvertOptions) -> None:
     """Refuse what only pose parameters have."""
     for name in ("up", "gender", "betas"):
-        if config[name] is not None:
+        if getattr(options, name) is not None:
             raise InputError(
                 name,
-                got=str(config[name]),
-                expected=f"none: vertices of {config.to} have the axes of that model",
+                got=str(getattr(options, name)),
+                expected=f"none: vertices of {options.to} have the axes of that model",
                 fix=f"Leave {name} out.",
             )

@@ -8,19 +8,15 @@ import logging
 import numpy as np
 import pytest
 import torch
-from omegaconf import OmegaConf
 from scipy.spatial.transform import Rotation
 
 from soma_core import SomaLayer
-from soma_core.config.schema import ConvertConfig
 from soma_core.errors import InputError
 from soma_core.io import USER_JOINTS, Motion, read_motion, write_motion
+from soma_core.motion import ConvertOptions, convert_file, converter, fit_job, layout_of
 from soma_core.plugin.errors import BackendError
 from soma_core.plugin.registry import default_registry
-from soma_core.tasks import convert_file
-from soma_core.tasks.convert_file import Converter, layout_of
-from soma_core.tasks.fit_job import ResultFiles
-from tests.tasks.conftest import AMASS_FRAMES
+from tests.motion.conftest import AMASS_FRAMES
 
 FIT_MM = 3.0
 """Mean distance of a fit to the stand-in, whose pose blend shapes are noise of about that size."""
@@ -28,13 +24,8 @@ FIT_MM = 3.0
 Z_UP_TO_Y_UP = np.array([[1, 0, 0], [0, 0, 1], [0, -1, 0]])
 
 
-def configured(**changes):
-    settings = {"picture": {"frames": 0}, "lod": "low", "out": ""}
-    return OmegaConf.merge(OmegaConf.structured(ConvertConfig), settings | changes)
-
-
 def converted(path, folder, **changes):
-    return Converter(configured(**changes))(path, ResultFiles.of_folder(folder), folder / "chunks")
+    return convert_file(path, folder, options=ConvertOptions(lod="low", **changes))
 
 
 def motion(frames=3, **changes):
@@ -123,8 +114,8 @@ def test_an_amass_motion_is_posed_by_its_own_model_and_fitted(smplh_models, amas
 
 def test_what_was_fitted_before_is_left_alone(smplh_models, amass, amass_file, tmp_path, monkeypatch):
     fits = []
-    original = convert_file.FitJob.fit_missing
-    monkeypatch.setattr(convert_file.FitJob, "fit_missing", lambda job: fits.append(original(job)))
+    original = converter.FitJob.fit_missing
+    monkeypatch.setattr(converter.FitJob, "fit_missing", lambda job: fits.append(original(job)))
     first = converted(amass_file, tmp_path / "out")
     again = converted(amass_file, tmp_path / "out")
     assert (first.earlier, again.earlier, len(fits)) == (False, True, 1)
@@ -142,7 +133,7 @@ def test_what_was_fitted_before_is_left_alone(smplh_models, amass, amass_file, t
 
 def test_a_stopped_conversion_goes_on(smplh_models, amass_file, tmp_path, monkeypatch, caplog):
     caplog.set_level("INFO")
-    original, saved = convert_file.FittedChunks.save, []
+    original, saved = fit_job.FittedChunks.save, []
 
     def save(chunks, number, arrays):
         original(chunks, number, arrays)
@@ -150,7 +141,7 @@ def test_a_stopped_conversion_goes_on(smplh_models, amass_file, tmp_path, monkey
         if len(saved) == 2:
             raise KeyboardInterrupt
 
-    monkeypatch.setattr(convert_file.FittedChunks, "save", save)
+    monkeypatch.setattr(fit_job.FittedChunks, "save", save)
     with pytest.raises(KeyboardInterrupt):
         converted(amass_file, tmp_path / "out", chunk=2)
     converted(amass_file, tmp_path / "out", chunk=2)

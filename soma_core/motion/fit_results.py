@@ -11,14 +11,14 @@ import torch
 
 from soma_core.inversion.report import InversionReport
 from soma_core.io.motion import Motion
-from soma_core.tasks.error_picture import error_sheet
-from soma_core.tasks.stage import Body
+from soma_core.view.error_picture import error_sheet
+from soma_core.view.stage import Body
 
 if TYPE_CHECKING:
     from soma_core.inversion.result import InversionResult
     from soma_core.layer import SomaLayer
+    from soma_core.motion.chunks import FittedChunks
     from soma_core.skeleton.identity import Identity
-    from soma_core.tasks.fitted_chunks import FittedChunks
 
 __all__ = ["chunk_arrays", "draw_worst", "fitted_motions", "joined_report", "per_frame", "worst_frames"]
 

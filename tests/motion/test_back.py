@@ -7,26 +7,19 @@ import pytest
 import torch
 
 from soma_core import SomaLayer
-from soma_core.config.schema import BackendChoice
 from soma_core.errors import InputError
 from soma_core.inversion import PoseInversion
 from soma_core.io import open_vertex_sequence, write_motion
 from soma_core.io.amass import read_amass
-from soma_core.tasks import convert_back
-from soma_core.tasks.convert_back import BackConverter
-from soma_core.tasks.fit_job import ResultFiles
-from tests.tasks.conftest import AMASS_FRAMES
-from tests.tasks.test_convert_file import configured, converted, motion, posed_smplh
+from soma_core.motion import BackendChoice, back
+from tests.motion.conftest import AMASS_FRAMES
+from tests.motion.test_converter import converted, motion, posed_smplh
 
 THERE_AND_BACK_MM = 5.0
 """Mean distance after two fits to stand-ins: each skin bends in a way of its own."""
 
 NATIVE_FIT_MM = 3.0
 """Root mean square error of the T-pose that comes back: the toy's mesh is coarser than ours."""
-
-
-def converted_back(path, folder, **changes):
-    return BackConverter(configured(**changes))(path, ResultFiles.of_folder(folder), folder / "chunks")
 
 
 @pytest.fixture(scope="session")
@@ -42,7 +35,7 @@ def fitted(smplh_supplied, amass, tmp_path_factory):
 
 
 def test_an_amass_motion_comes_back(smplh_models, fitted, amass, tmp_path):
-    found = converted_back(fitted, tmp_path, to="smplh", chunk=4)
+    found = converted(fitted, tmp_path, to="smplh", chunk=4)
     again = read_amass(tmp_path / "motion.npz")
     assert (again.model, again.gender, again.fps, again.up) == ("smplh", "female", 60, "+z")
     np.testing.assert_array_equal(again.betas, np.float32([0.5, -1.0]))
@@ -58,15 +51,15 @@ def test_an_amass_motion_comes_back(smplh_models, fitted, amass, tmp_path):
     with np.load(tmp_path / "frames.npz") as frames:
         assert 1e3 * frames["mean_error"].mean() == pytest.approx(found.error_mm["mean"], rel=1e-3)
     assert not (tmp_path / "chunks").exists()
-    assert converted_back(fitted, tmp_path, to="smplh", chunk=4).earlier
+    assert converted(fitted, tmp_path, to="smplh", chunk=4).earlier
 
 
 def test_an_unknown_body_is_found_once(smplh_models, fitted, tmp_path, monkeypatch):
     """Somebody of another backend: betas are sought, and a stopped run does not seek them again."""
     searches, saves = [], []
-    search, save = convert_back.NativeFit.fit_params, convert_back.FittedChunks.save
+    search, save = back.NativeFit.fit_params, back.FittedChunks.save
     monkeypatch.setattr(
-        convert_back.NativeFit,
+        back.NativeFit,
         "fit_params",
         lambda *given: searches.append(1) or search(*given, iterations=2),
     )
@@ -77,12 +70,12 @@ def test_an_unknown_body_is_found_once(smplh_models, fitted, tmp_path, monkeypat
         if len(saves) == 1:
             raise KeyboardInterrupt
 
-    monkeypatch.setattr(convert_back.FittedChunks, "save", stopping)
+    monkeypatch.setattr(back.FittedChunks, "save", stopping)
     choice = {"to": "smplh", "gender": "female", "chunk": 3, "up": "y",
               "backend": BackendChoice(name="soma", params={"shape": [1.0]})}  # fmt: skip
     with pytest.raises(KeyboardInterrupt):
-        converted_back(fitted, tmp_path, **choice)
-    found = converted_back(fitted, tmp_path, **choice)
+        converted(fitted, tmp_path, **choice)
+    found = converted(fitted, tmp_path, **choice)
     assert (len(searches), saves) == (1, [0, 1])
     motion = read_amass(tmp_path / "motion.npz", up="+y")
     np.testing.assert_array_equal(motion.betas, np.float32(found.report["settings"]["found"]["betas"]))
@@ -91,7 +84,7 @@ def test_an_unknown_body_is_found_once(smplh_models, fitted, tmp_path, monkeypat
 
 
 def test_betas_that_are_given_are_used(smplh_models, fitted, tmp_path):
-    converted_back(fitted, tmp_path, to="smplh", betas=[0.25])
+    converted(fitted, tmp_path, to="smplh", betas=[0.25])
     np.testing.assert_array_equal(read_amass(tmp_path / "motion.npz").betas, np.float32([0.25]))
 
 
@@ -103,7 +96,7 @@ def test_vertices_of_another_topology_come_back_through_the_inversion(tmp_path):
         identity={"backend": "toy", "params": {"legs": 1.1}},
     )  # fmt: skip
     write_motion(still, tmp_path / "m.npz")
-    found = converted_back(tmp_path / "m.npz", tmp_path, to="toy")
+    found = converted(tmp_path / "m.npz", tmp_path, to="toy")
     assert str(found) == "soma, 2 frames at 24 fps, posed"
     layer = SomaLayer("toy", lod="low")
     with open_vertex_sequence(tmp_path / "vertices.npz") as sequence:
@@ -117,7 +110,7 @@ def test_vertices_of_another_topology_come_back_through_the_inversion(tmp_path):
 def test_the_body_can_be_put_on_the_ground(tmp_path):
     pytest.importorskip("soma_backend_toy")
     write_motion(motion(frames=1, identity={"backend": "toy", "params": {}}), tmp_path / "m.npz")
-    converted_back(tmp_path / "m.npz", tmp_path / "ground", to="toy", translation="ground")
+    converted(tmp_path / "m.npz", tmp_path / "ground", to="toy", translation="ground")
     lowest = {}
     with open_vertex_sequence(tmp_path / "ground/vertices.npz") as sequence:
         lowest = sequence.metres * sequence.read(0, 1)[..., "xyz".index(sequence.up[1])].min()
@@ -140,13 +133,13 @@ def test_what_vertices_do_not_have_is_refused(tmp_path, changes, said):
     pytest.importorskip("soma_backend_toy")
     write_motion(motion(identity={"backend": "toy", "params": {}}), tmp_path / "m.npz")
     with pytest.raises(InputError, match=said):
-        converted_back(tmp_path / "m.npz", tmp_path, **changes)
+        converted(tmp_path / "m.npz", tmp_path, **changes)
 
 
 def test_a_motion_without_a_body_needs_one(tmp_path):
     write_motion(motion(), tmp_path / "m.npz")
     with pytest.raises(InputError, match=r"backend: got none, and no body in m\.npz.*Pass backend=NAME"):
-        converted_back(tmp_path / "m.npz", tmp_path, to="smplh")
+        converted(tmp_path / "m.npz", tmp_path, to="smplh")
 
 
 @pytest.mark.parametrize(
@@ -159,4 +152,4 @@ def test_a_motion_without_a_body_needs_one(tmp_path):
 def test_what_is_no_motion_on_this_skeleton_is_refused(tmp_path, keys, said):
     np.savez(tmp_path / "m.npz", **keys)
     with pytest.raises(InputError, match=said):
-        converted_back(tmp_path / "m.npz", tmp_path, to="smplh")
+        converted(tmp_path / "m.npz", tmp_path, to="smplh")

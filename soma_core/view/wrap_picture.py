@@ -15,8 +15,8 @@ from soma_core.geometry.mesh import vertex_normals
 from soma_core.registration.quality import Quality
 from soma_core.registration.register import Registration
 from soma_core.rig.mesh import CanonicalMesh
-from soma_core.tasks.error_picture import colour_bar, error_colours, scale_top
-from soma_core.tasks.stage import PAPER, quiet_display
+from soma_core.view.error_picture import colour_bar, error_colours, scale_top
+from soma_core.view.stage import PAPER, quiet_display
 
 if TYPE_CHECKING:
     from PIL.Image import Image

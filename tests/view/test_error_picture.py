@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from soma_core.tasks.error_picture import colour_bar, error_colours, error_sheet, scale_top
-from soma_core.tasks.stage import Body
+from soma_core.view.error_picture import colour_bar, error_colours, error_sheet, scale_top
+from soma_core.view.stage import Body
 
 PIL = pytest.importorskip("PIL.Image", reason="pictures need pyvista and Pillow")
 

@@ -3,36 +3,34 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from omegaconf import OmegaConf
 from scipy.spatial.transform import Rotation
 
 from soma_core.errors import AssetError, InputError
 from soma_core.io.amass import SmplMotion, read_amass
 from soma_core.io.sam3d import Sam3dFrames, read_sam3d
-from soma_core.plugin.errors import BackendError, BrokenBackendError
-from soma_core.plugin.registry import default_registry
-from soma_core.tasks.animate import given_params
-from soma_core.tasks.posed_input import PosedInput
-from soma_core.tasks.posed_model import (
+from soma_core.io.vertex_files import open_vertex_sequence
+from soma_core.motion.models import (
     FitBackend,
     FitBackends,
     HeldSequence,
     ModelSequence,
     TransferredSequence,
 )
+from soma_core.motion.options import ConvertOptions, FitOptions, InvertOptions
+from soma_core.motion.posed_input import PosedInput
+from soma_core.plugin.errors import BackendError, BrokenBackendError
+from soma_core.plugin.registry import default_registry
 
 if TYPE_CHECKING:
-    from omegaconf import DictConfig
-
     from soma_core.plugin.spec import BackendSpec
 
-__all__ = ["ShownBody", "sam3d_body", "smpl_body"]
+__all__ = ["FITTED", "ShownBody", "open_body"]
 
 _log = logging.getLogger(__name__)
 
@@ -62,10 +60,62 @@ class ShownBody:
     params: Mapping[str, Any]
     search: Mapping[str, Any]
     facts: Mapping[str, Any]
-    licence: str
+    licence: str = ""
 
 
-def smpl_body(path: Path, config: DictConfig, backends: FitBackends) -> ShownBody:
+def open_body(path: Path, layout: str, options: FitOptions, backends: FitBackends | None = None) -> ShownBody:
+    """The body that a file shows, ready to be fitted.
+
+    Args:
+        path: the file, or a folder of meshes.
+        layout: one of `FITTED`.
+        options: of the fit.
+        backends: layers and fits, to share them between files.
+
+    Raises:
+        SomaError: the file, or the backend that it needs, cannot be used.
+    """
+    return FITTED[layout](path, options, backends or FitBackends(options))
+
+
+def _vertex_body(path: Path, options: InvertOptions, backends: FitBackends) -> ShownBody:
+    """Vertices over time, of the canonical mesh or of a backend's.
+
+    Raises:
+        SomaError: the file cannot be read, or is none of the backend's.
+        InputError: no frame rate.
+    """
+    sequence = open_vertex_sequence(
+        path,
+        fps=options.fps,
+        unit=str(options.unit) if options.unit else None,
+        up=f"+{options.up}" if options.up else None,
+    )
+    try:
+        if sequence.fps is None:
+            raise InputError(
+                "fps", got=f"none in {path.name}", expected="frames per second", fix="Pass fps=30."
+            )
+        backend = backends.get(options.backend.name, options.backend.options)
+        posed = PosedInput(sequence, backend.layer, topology=options.topology)
+    except BaseException:
+        sequence.close()
+        raise
+    return ShownBody(
+        backend=backend,
+        posed=posed,
+        params=options.backend.params,
+        search=_search(options),
+        facts={"unit_m": sequence.metres, "up": sequence.up, "topology": str(posed.topology)},
+    )
+
+
+def _search(options: FitOptions) -> dict[str, Any]:
+    """Choices of the search for an identity, of which nothing matters where it is known."""
+    return {} if options.identity.method == "known" else asdict(options.identity)
+
+
+def _smpl_body(path: Path, options: ConvertOptions, backends: FitBackends) -> ShownBody:
     """The body of an AMASS file: its model, posed with its betas and gender.
 
     Raises:
@@ -73,13 +123,13 @@ def smpl_body(path: Path, config: DictConfig, backends: FitBackends) -> ShownBod
     """
     motion = read_amass(
         path,
-        fps=config.fps,
-        gender=str(config.gender) if config.gender else None,
-        up=f"+{config.up}" if config.up else None,
+        fps=options.fps,
+        gender=str(options.gender) if options.gender else None,
+        up=f"+{options.up}" if options.up else None,
     )
     _warn_lying(path, motion)
     backend = backends.get(motion.model, {"gender": motion.gender})
-    params = {"betas": _usable_betas(path, motion, backend.layer.spec, config.most_betas)}
+    params = {"betas": _usable_betas(path, motion, backend.layer.spec, options.most_betas)}
     pose = {"rotations": motion.rotations, "translation": motion.translation}
     sequence = ModelSequence(path, backend, params, pose, fps=motion.fps, up=motion.up)
     return ShownBody(
@@ -121,14 +171,14 @@ def _warn_lying(path: Path, motion: SmplMotion) -> None:
         )  # fmt: skip
 
 
-def sam3d_body(path: Path, config: DictConfig, backends: FitBackends) -> ShownBody:
+def _sam3d_body(path: Path, options: ConvertOptions, backends: FitBackends) -> ShownBody:
     """The body of a SAM 3D Body output: MHR with the file's parameters, or one that is yet to be found.
 
     Raises:
         SomaError: the file cannot be read, or the user's MHR model or its wrap pair is not there.
         InputError: no frame rate, or no parameters in the file.
     """
-    if config.fps is None:
+    if options.fps is None:
         raise InputError(
             f"{path}: fps", got="none: SAM 3D Body sees pictures", expected="frames per second",
             fix="Pass fps=30 (or the true rate).",
@@ -137,17 +187,16 @@ def sam3d_body(path: Path, config: DictConfig, backends: FitBackends) -> ShownBo
     vertices = frames.vertices
     if frames.placement is not None:
         vertices = vertices + frames.placement[:, None]
-    sequence = HeldSequence(path, vertices, fps=float(config.fps))
-    known = str(config.identity.method) == "known"
-    backend, params = _known_mhr(frames, config, backends) if known else _sought(config, backends)
+    sequence = HeldSequence(path, vertices, fps=float(options.fps))
+    known = options.identity.method == "known"
+    backend, params = _known_mhr(frames, options, backends) if known else _sought(options, backends)
     if known:
         posed = PosedInput(sequence, backend.layer, topology="native")
     else:
         _check_mhr_pair()
         posed = PosedInput(TransferredSequence(sequence, _MHR), backend.layer, topology="canonical")
-    search = {} if known else OmegaConf.to_container(config.identity, resolve=True)
     return ShownBody(
-        backend=backend, posed=posed, params=params, search=search, facts={"up": "+y"},
+        backend=backend, posed=posed, params=params, search=_search(options), facts={"up": "+y"},
         licence=f"that of {path.name}",
     )  # fmt: skip
 
@@ -170,24 +219,24 @@ def _check_mhr_pair() -> None:
 
 
 def _known_mhr(
-    frames: Sam3dFrames, config: DictConfig, backends: FitBackends
+    frames: Sam3dFrames, options: ConvertOptions, backends: FitBackends
 ) -> tuple[FitBackend, dict[str, Any]]:
     """The user's MHR model, and the body that the file describes."""
-    chosen = config.backend
-    options = given_params(chosen.options) if chosen is not None and chosen.name == _MHR else {}
+    chosen = options.backend
+    own = chosen.options if chosen is not None and chosen.name == _MHR else {}
     try:
-        return backends.get(_MHR, options), _mhr_params(frames)
+        return backends.get(_MHR, own), _mhr_params(frames)
     except BackendError as error:
         fix = f"{error.fix.rstrip('.')}. Or pass identity=unknown, which needs the wrap pair alone"
         raise BrokenBackendError(who=error.who, stage=error.stage, cause=error.cause, fix=fix) from error
 
 
-def _sought(config: DictConfig, backends: FitBackends) -> tuple[FitBackend, dict[str, Any]]:
+def _sought(options: ConvertOptions, backends: FitBackends) -> tuple[FitBackend, dict[str, Any]]:
     """The backend in whose shapes a body is sought, and where the search begins."""
-    chosen = config.backend
+    chosen = options.backend
     if chosen is None:
         return backends.get(_DEFAULT, {}), {}
-    return backends.get(chosen.name, given_params(chosen.options)), given_params(chosen.params)
+    return backends.get(chosen.name, chosen.options), chosen.params
 
 
 def _mhr_params(frames: Sam3dFrames) -> dict[str, list[float]]:
@@ -207,3 +256,9 @@ def _mhr_params(frames: Sam3dFrames) -> dict[str, list[float]]:
     shape, model = (frames.parameters[key].astype(np.float64) for key in ("shape_params", "mhr_model_params"))
     seen = {"identity": shape, "bone_lengths": model[:, _BONE_LENGTHS], "scales": model[:, _SCALES]}
     return {name: values.mean(axis=0).tolist() for name, values in seen.items()}
+
+
+FITTED: dict[str, Callable[[Path, Any, FitBackends], ShownBody]] = {
+    "vertices": _vertex_body, "amass": _smpl_body, "sam3d": _sam3d_body,
+}  # fmt: skip
+"""Layouts whose bodies are fitted, and their readers."""

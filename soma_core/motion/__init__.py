@@ -1,0 +1,60 @@
+"""Motions of other tools to this skeleton and back: read, written, converted, fitted, played.
+
+The names are loaded when they are first used: options cost no torch.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from soma_core._lazy import lazy_names
+
+if TYPE_CHECKING:
+    from soma_core.motion.animated import Animated, animate, load_clip
+    from soma_core.motion.conversion import FolderConverted, convert, convert_file, convert_folder
+    from soma_core.motion.converter import Converted, finish_fit, invert, plan_fit
+    from soma_core.motion.files import layout_of, read, write
+    from soma_core.motion.fit_job import FitPlan, fit_chunks
+    from soma_core.motion.identities import stored_identity
+    from soma_core.motion.options import ConvertOptions, FitOptions, InvertOptions
+    from soma_core.options import BackendChoice, IdentityChoice, InversionChoice, Picture
+
+__all__ = [
+    "Animated",
+    "BackendChoice",
+    "ConvertOptions",
+    "Converted",
+    "FitOptions",
+    "FitPlan",
+    "FolderConverted",
+    "IdentityChoice",
+    "InversionChoice",
+    "InvertOptions",
+    "Picture",
+    "animate",
+    "convert",
+    "convert_file",
+    "convert_folder",
+    "finish_fit",
+    "fit_chunks",
+    "invert",
+    "layout_of",
+    "load_clip",
+    "plan_fit",
+    "read",
+    "stored_identity",
+    "write",
+]
+
+_HOMES = {
+    "soma_core.motion.animated": ["Animated", "animate", "load_clip"],
+    "soma_core.motion.conversion": ["FolderConverted", "convert", "convert_file", "convert_folder"],
+    "soma_core.motion.converter": ["Converted", "finish_fit", "invert", "plan_fit"],
+    "soma_core.motion.files": ["layout_of", "read", "write"],
+    "soma_core.motion.fit_job": ["FitPlan", "fit_chunks"],
+    "soma_core.motion.identities": ["stored_identity"],
+    "soma_core.motion.options": ["ConvertOptions", "FitOptions", "InvertOptions"],
+    "soma_core.options": ["BackendChoice", "IdentityChoice", "InversionChoice", "Picture"],
+}
+
+__getattr__, __dir__ = lazy_names(__name__, _HOMES)

@@ -1,0 +1,152 @@
+"""Conversion of a file, or of a folder of them, to this skeleton and back."""
+
+from __future__ import annotations
+
+import json
+import logging
+import shutil
+import tempfile
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+from soma_core.cache import atomic_text
+from soma_core.errors import InputError, SomaError
+from soma_core.io.motion import Motion
+from soma_core.motion.back import BackConverter
+from soma_core.motion.converter import Converted, Converter
+from soma_core.motion.files import SUFFIXES, ResultFiles, layout_of
+from soma_core.motion.options import ConvertOptions
+from soma_core.options import Picture
+
+__all__ = ["FolderConverted", "convert", "convert_file", "convert_folder"]
+
+_log = logging.getLogger(__name__)
+
+
+def convert(source: str | Path, *, options: ConvertOptions | None = None) -> Motion:
+    """Bring a motion of another tool to this skeleton; nothing is kept on disk.
+
+    Args:
+        source: a file of AMASS, SAM 3D Body, kimodo or SOMA tools.
+        options: of the conversion.
+
+    Raises:
+        SomaError: the file, or the backend that it needs, cannot be used, or the fit is none.
+        InputError: the options lead to another model, which :func:`convert_file` does.
+    """
+    options = options or ConvertOptions()
+    if options.to != "soma":
+        raise InputError("to", got=options.to, expected="soma", fix="Use convert_file for the way back.")
+    with tempfile.TemporaryDirectory() as folder:
+        return convert_file(source, folder, options=replace(options, picture=Picture(frames=0))).motion()
+
+
+def convert_file(source: str | Path, out: str | Path, *, options: ConvertOptions | None = None) -> Converted:
+    """Convert a file; write the motion, the errors and a report.
+
+    Finished chunks stay in ``out/chunks`` until the end: the same call goes on after them. A body that was
+    fitted before, with the same settings, is not fitted again.
+
+    Args:
+        source: a file of AMASS, SAM 3D Body, kimodo or SOMA tools; for the way back, one of this skeleton.
+        out: folder of the results: ``motion.npz``, or ``vertices.npz`` on the way back to vertices.
+        options: of the conversion.
+
+    Raises:
+        SomaError: the file, or the backend that it needs, cannot be used, or the fit is none.
+        InputError: it holds no motion, or was converted before with other settings.
+    """
+    out = Path(out)
+    convert = _converter(options or ConvertOptions())
+    return convert(Path(source).expanduser(), ResultFiles.of_folder(out), out / "chunks")
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class FolderConverted:
+    """What became of the files of a folder, by their names in it.
+
+    Attributes:
+        converted: those that were converted, by this call or an earlier one.
+        errors: what was wrong with those that were not.
+        skipped: those that hold no motion.
+    """
+
+    converted: dict[str, Converted] = field(default_factory=dict)
+    errors: dict[str, SomaError] = field(default_factory=dict)
+    skipped: list[str] = field(default_factory=list)
+
+    def __len__(self) -> int:
+        return len(self.converted) + len(self.errors) + len(self.skipped)
+
+
+def convert_folder(
+    folder: str | Path, out: str | Path, *, options: ConvertOptions | None = None
+) -> FolderConverted:
+    """Convert every file in a folder; those that cannot be are left out and listed.
+
+    The folder is mirrored: ``motions`` and ``reports`` in `out` hold a file for each of its files, and
+    ``report.json`` lists them all. The same call goes on where an earlier one was stopped; what is there
+    already is not done again.
+
+    Args:
+        folder: motion files at any depth.
+        out: folder of the results; it may lie in `folder`.
+        options: of the conversions.
+
+    Raises:
+        InputError: no file may hold a motion.
+    """
+    folder, out = Path(folder).expanduser(), Path(out)
+    files = [file for file in _files(folder) if not file.is_relative_to(out.resolve())]
+    if not files:
+        raise InputError(
+            str(folder),
+            got=f"no file ending in {' or '.join(SUFFIXES)}",
+            expected="motion files, at any depth",
+            fix="Name the folder that holds them.",
+        )
+    convert, found, rows = _converter(options or ConvertOptions()), FolderConverted(), {}
+    try:
+        for number, file in enumerate(files, start=1):
+            name = file.relative_to(folder.resolve()).as_posix()
+            rows[name], told = _row(convert, file, out, name, found)
+            level = logging.WARNING if name in found.errors else logging.INFO
+            _log.log(level, "%d of %d: %s: %s", number, len(files), name, told)
+    finally:
+        document = {"input": str(folder.resolve()), "files": rows}
+        atomic_text(out / "report.json", json.dumps(document, indent=2) + "\n")
+    shutil.rmtree(out / "chunks", ignore_errors=True)
+    return found
+
+
+def _converter(options: ConvertOptions) -> Converter | BackConverter:
+    return Converter(options) if options.to == "soma" else BackConverter(options)
+
+
+def _files(folder: Path) -> Iterator[Path]:
+    """Files that may hold a motion, hidden ones apart, in the order of their names."""
+    for file in sorted(folder.resolve().rglob("*")):
+        hidden = any(part.startswith(".") for part in file.relative_to(folder.resolve()).parts)
+        if file.suffix.lower() in SUFFIXES and not hidden and file.is_file():
+            yield file
+
+
+def _row(
+    convert: Converter | BackConverter, file: Path, out: Path, name: str, found: FolderConverted
+) -> tuple[Mapping[str, Any], str]:
+    """Convert one file of a folder; what becomes of it as a row of the report, and in words."""
+    try:
+        if layout_of(file) is None:
+            found.skipped.append(name)
+            return {"state": "skipped", "reason": "holds no motion"}, "holds no motion"
+        converted = convert(file, ResultFiles.mirrored(out, name), out / "chunks" / name)
+    except SomaError as error:
+        found.errors[name] = error
+        return {"state": "failed", "reason": str(error)}, str(error)
+    found.converted[name] = converted
+    report = converted.report
+    row = {"state": "converted", "layout": report["settings"]["layout"], "frames": report["frames"],
+           "fps": report["settings"]["fps"], "error_mm": converted.error_mm}  # fmt: skip
+    return row, str(converted)

@@ -1,0 +1,245 @@
+"""One file to a motion of this skeleton: rotations carried over, or its body fitted."""
+
+from __future__ import annotations
+
+import json
+import logging
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from soma_core.cache import atomic_text
+from soma_core.errors import InputError, SomaError
+from soma_core.io.motion import Motion
+from soma_core.io.motion_files import read_motion
+from soma_core.motion.bodies import FITTED, open_body
+from soma_core.motion.chunks import refuse_other_settings
+from soma_core.motion.files import Layout, ResultFiles, layout_of, read, write
+from soma_core.motion.fit_job import FitJob, FitPlan, fit_settings, plan_body
+from soma_core.motion.models import FitBackends
+from soma_core.motion.options import ConvertOptions, InvertOptions
+
+__all__ = ["Converted", "Converter", "earlier_report", "finish_fit", "invert", "plan_fit"]
+
+_log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Converted:
+    """What became of a file: its report, and whether an earlier run made it.
+
+    Attributes:
+        report: as it was written.
+        files: where the results lie.
+        earlier: whether an earlier run made it.
+        vertices: whether they are the result, and no motion.
+    """
+
+    report: Mapping[str, Any]
+    files: ResultFiles
+    earlier: bool = False
+    vertices: bool = False
+
+    def motion(self) -> Motion:
+        """Read the motion that came out.
+
+        Raises:
+            AssetError: none did, or it is no longer there.
+        """
+        return read_motion(self.files.motion)
+
+    @property
+    def error_mm(self) -> Mapping[str, float | None] | None:
+        """Figures of the error over the whole body; None where rotations were carried over."""
+        return self.report.get("error_mm", {}).get("all")
+
+    def __str__(self) -> str:
+        settings, error = self.report["settings"], self.error_mm
+        told = f"{settings['layout']}, {self.report['frames']} frames at {settings['fps']:g} fps"
+        earlier = " (by an earlier run)" if self.earlier else ""
+        if error is None:
+            return f"{told}, {'posed' if self.vertices else 'rotations carried over'}{earlier}"
+        if error["mean"] is None:
+            return f"{told}, of which none could be used{earlier}"
+        figures = f"mean {error['mean']:.3g}, P95 {error['p95']:.3g}, max {error['max']:.3g} mm"
+        return f"{told}, fitted with an error of {figures}{earlier}"
+
+
+class Converter:
+    """Converts one file after another to motions of this skeleton; backends and fits serve all of them.
+
+    Args:
+        options: of the conversion.
+    """
+
+    def __init__(self, options: ConvertOptions) -> None:
+        self._options, self._backends = options, FitBackends(options)
+
+    def __call__(self, path: Path, files: ResultFiles, chunks: Path) -> Converted:
+        """Convert a file.
+
+        A body that was fitted before, with the same settings, is not fitted again.
+
+        Args:
+            path: what to convert.
+            files: where the results go.
+            chunks: folder for the finished parts of a fit, until its end.
+
+        Raises:
+            SomaError: the file, or the backend that it needs, cannot be used.
+            InputError: it holds no motion, or was fitted before with other settings.
+        """
+        layout = _known_layout(path)
+        if layout not in FITTED:
+            return self._carry_over(path, layout, files)
+        options = self._options
+        body = open_body(path, layout, options, self._backends)
+        earlier = earlier_report(files.report, files.motion, fit_settings(path, layout, body, options))
+        if earlier is not None:
+            _refuse_failed(path, earlier, files.report)
+            return Converted(report=earlier, files=files, earlier=True)
+        return _finished(FitJob(plan=plan_body(path, layout, body, options, files, chunks), body=body))
+
+    def _carry_over(self, path: Path, layout: Layout, files: ResultFiles) -> Converted:
+        """Write the rotations of a file on this skeleton as they are, in metres."""
+        motion = read(path, fps=self._options.fps, unit=self._options.unit)
+        write(motion, files.motion)
+        report = {
+            "settings": {"input": str(path.resolve()), "layout": layout, "fps": motion.fps},
+            "frames": motion.frame_count,
+            "convention": motion.convention,
+            "identity": motion.identity.get("backend"),
+            "rotations": "carried over as they are",
+        }
+        atomic_text(files.report, json.dumps(report, indent=2) + "\n")
+        return Converted(report=report, files=files)
+
+
+def _known_layout(path: Path) -> Layout:
+    """Layout of a file that must hold a motion.
+
+    Raises:
+        InputError: it holds none.
+    """
+    layout = layout_of(path)
+    if layout is None:
+        raise InputError(
+            str(path),
+            got="no motion under any key that is known",
+            expected="the keys of an AMASS, SAM 3D Body, kimodo or SOMA file",
+            fix="Vertices over time are what soma invert takes.",
+        )
+    return layout
+
+
+def invert(source: str | Path, out: str | Path, *, options: InvertOptions | None = None) -> Converted:
+    """Find the pose of every frame of a moving mesh; write the motion, the errors and a report.
+
+    Frames are read, fitted and stored chunk by chunk, so memory does not grow with their number. Finished
+    chunks stay in ``out/chunks`` until the end: the same call goes on after them.
+
+    Args:
+        source: an ``.npz`` or ``.npy`` of vertices, a folder of meshes, a ``.usd`` or a ``.glb``.
+        out: folder of the results.
+        options: of the fit.
+
+    Raises:
+        SomaError: the backend or the file cannot be used, or the fit is none; what there is of it is
+            written all the same.
+    """
+    source, out, options = Path(source).expanduser(), Path(out), options or InvertOptions()
+    body, files = open_body(source, "vertices", options), ResultFiles.of_folder(out)
+    with body.posed.sequence as shown:
+        _log.info(
+            "%s: %d frames of %d vertices (%s) at %g fps",
+            source.name, shown.frame_count, shown.vertex_count, body.posed.topology, shown.fps,
+        )  # fmt: skip
+        plan = plan_body(source, "vertices", body, options, files, out / "chunks")
+        return _finished(FitJob(plan=plan, body=body))
+
+
+def plan_fit(
+    source: str | Path, out: str | Path, *, options: ConvertOptions | InvertOptions | None = None
+) -> FitPlan:
+    """Plan a fit whose chunks other processes do: :func:`fit_chunks` in them, :func:`finish_fit` at the end.
+
+    Args:
+        source: a file of AMASS or SAM 3D Body, or with ``InvertOptions`` vertices over time.
+        out: folder of the results, which all processes must reach.
+        options: of the conversion, or of the fit to vertices.
+
+    Raises:
+        SomaError: the backend or the file cannot be used.
+        InputError: the file is of this skeleton, and needs no fit.
+    """
+    source, out, options = Path(source).expanduser(), Path(out), options or ConvertOptions()
+    layout = "vertices" if isinstance(options, InvertOptions) else _known_layout(source)
+    if layout not in FITTED:
+        raise InputError(
+            str(source), got=f"the layout {layout}", expected="a body to fit", fix="Convert or read it."
+        )
+    body = open_body(source, layout, options)
+    with body.posed.sequence:
+        return plan_body(source, layout, body, options, ResultFiles.of_folder(out), out / "chunks")
+
+
+def finish_fit(plan: FitPlan) -> Converted:
+    """Fit what is missing of a plan, and join its chunks into the files of the result.
+
+    Raises:
+        SomaError: the fit is none; what there is of it is written all the same.
+    """
+    body = open_body(plan.source, plan.layout, plan.options)
+    with body.posed.sequence:
+        return _finished(FitJob(plan=plan, body=body))
+
+
+def _finished(job: FitJob) -> Converted:
+    job.fit_missing()
+    summary, plan = job.write_results(), job.plan
+    vertices = plan.layout == "vertices"
+    for line in summary.as_text().splitlines() if vertices else ():
+        _log.info("%s", line)
+    report = _read_report(plan.files.report)
+    _refuse_failed(plan.source, report, plan.files.report, axes_known=not vertices)
+    return Converted(report=report, files=plan.files)
+
+
+def earlier_report(file: Path, result: Path, settings: Mapping[str, Any]) -> dict[str, Any] | None:
+    """The report `file` if an earlier run left it and `result`, with the same settings for the same input.
+
+    Raises:
+        InputError: the earlier run had other settings.
+    """
+    if not (file.is_file() and result.is_file()):
+        return None
+    try:
+        report = _read_report(file)
+        before = dict(report["settings"])
+    except (ValueError, KeyError, TypeError):
+        return None  # no report of ours
+    now = json.loads(json.dumps(settings, default=str))
+    before.pop("found", None)
+    if before.pop("content", None) != now.pop("content"):
+        return None  # the file was written anew
+    refuse_other_settings(file, before, now)
+    return report
+
+
+def _refuse_failed(path: Path, report: Mapping[str, Any], file: Path, *, axes_known: bool = True) -> None:
+    """Refuse a fit that is none; where a body lies, readers say themselves that know a file's axes.
+
+    Raises:
+        SomaError: what is wrong with it.
+    """
+    found = report.get("diagnosis")
+    if not found or (axes_known and found["cause"] == "axis"):
+        return
+    if found["failed"]:
+        raise SomaError(f"{path}: {found['sentence']}; {file} has the figures.")
+    _log.warning("%s: %s", path.name, found["sentence"])
+
+
+def _read_report(path: Path) -> dict[str, Any]:
+    return dict(json.loads(path.read_text(encoding="utf-8")))

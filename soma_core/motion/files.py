@@ -1,0 +1,114 @@
+"""Files of motions: which layout a file has, motions on this skeleton read and written, where results go."""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+from soma_core.io.amass import holds_smpl_motion
+from soma_core.io.motion import Motion
+from soma_core.io.motion_files import read_motion, write_motion
+from soma_core.io.npz_fields import open_npz
+from soma_core.io.sam3d import SAM3D_SUFFIXES
+from soma_core.io.soma_npz import METRES_PER_UNIT
+from soma_core.options import LengthUnit
+from soma_core.rig import load_canonical
+from soma_core.topology.frames import METRES
+
+__all__ = ["SUFFIXES", "Layout", "ResultFiles", "fingerprint", "layout_of", "read", "write"]
+
+Layout = Literal["soma", "kimodo", "amass", "sam3d"]
+
+SUFFIXES = SAM3D_SUFFIXES
+"""Files that may hold a motion."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ResultFiles:
+    """Where results go: motions, or vertices where there are no motions to be had."""
+
+    motion: Path
+    vertices: Path
+    frames: Path
+    report: Path
+    picture: Path
+
+    @classmethod
+    def of_folder(cls, folder: Path) -> ResultFiles:
+        """The usual names in a folder of their own."""
+        return cls(
+            motion=folder / "motion.npz",
+            vertices=folder / "vertices.npz",
+            frames=folder / "frames.npz",
+            report=folder / "report.json",
+            picture=folder / "errors.png",
+        )
+
+    @classmethod
+    def mirrored(cls, folder: Path, name: str) -> ResultFiles:
+        """Those of the file `name` of a folder: ``motions``, ``vertices`` and ``reports`` mirror it."""
+        if not name.lower().endswith(".npz"):
+            name = f"{name}.npz"
+        report = folder / "reports" / name
+        return cls(
+            motion=folder / "motions" / name,
+            vertices=folder / "vertices" / name,
+            frames=report.with_suffix(".frames.npz"),
+            report=report.with_suffix(".json"),
+            picture=report.with_suffix(".png"),
+        )
+
+
+def layout_of(path: Path) -> Layout | None:
+    """Which motion a file holds, told by its keys; None where it holds none.
+
+    Raises:
+        AssetError: the file is missing, damaged, a git-LFS pointer or no NPZ.
+    """
+    if path.suffix.lower() == ".parquet":
+        return "sam3d"
+    with open_npz(path) as fields:
+        if "global_rot_mats" in fields or "local_rot_mats" in fields:
+            return "kimodo"
+        if "pred_vertices" in fields:
+            return "sam3d"
+        if holds_smpl_motion(fields):
+            return "amass"
+        return "soma" if "schema_version" in fields or {"poses", "transl"} <= {*fields.names} else None
+
+
+def read(path: str | Path, *, fps: float | None = None, unit: LengthUnit | str | None = None) -> Motion:
+    """Read a motion on this skeleton: a file of this project, of the SOMA tools or of kimodo.
+
+    Args:
+        path: the file. What other skeletons move in is for :func:`convert`.
+        fps: frame rate, where the file has none.
+        unit: ``m``, ``cm`` or ``mm``; overrides the file's own.
+
+    Raises:
+        AssetError: the file is missing, damaged, a git-LFS pointer or no NPZ.
+        InputError: the layout is unknown, or a key is missing or holds what a motion cannot have.
+    """
+    metres = METRES[str(unit)] if unit else None
+    name = next((name for name, length in METRES_PER_UNIT.items() if length == metres), None)
+    return read_motion(path, fps=fps, unit=name)
+
+
+def write(motion: Motion, path: str | Path) -> None:
+    """Write a motion in this project's schema, atomically; the SOMA tools read it as well.
+
+    Raises:
+        InputError: the joints are not the 77 user joints in order, or a matrix is no rotation.
+    """
+    write_motion(motion, path, joint_orient=load_canonical("mid")[1].t_pose_world[1:, :3, :3])
+
+
+def fingerprint(path: Path) -> str:
+    """Names, sizes and times of change of a file, or of each file in a folder."""
+    digest = hashlib.sha256()
+    for file in sorted(path.iterdir()) if path.is_dir() else [path]:
+        state = file.stat()
+        digest.update(f"{file.name} {state.st_size} {state.st_mtime_ns}\n".encode())
+    return digest.hexdigest()[:16]

@@ -1,0 +1,51 @@
+"""Options: names of closed choices, what is refused when they are made, and how they travel."""
+
+from __future__ import annotations
+
+import copy
+import pickle
+from dataclasses import FrozenInstanceError, replace
+
+import pytest
+
+from soma_core.errors import InputError
+from soma_core.motion import BackendChoice, ConvertOptions, IdentityChoice, InvertOptions
+from soma_core.options import FitLod, Lod, ModelOptions
+
+
+def test_names_become_members_of_their_choice():
+    assert ModelOptions(lod="xlo").lod is Lod.xlo
+    assert InvertOptions(lod="low").lod is FitLod.low
+    with pytest.raises(InputError, match="lod: got 'xlo', expected one of mid, low"):
+        InvertOptions(lod="xlo")
+    with pytest.raises(InputError, match="unit: got 'inch', expected one of m, cm, mm"):
+        ConvertOptions(unit="inch")
+
+
+def test_null_parameters_take_their_default():
+    given = {"age": None, "weight": 0.3, "shape": [1, 2]}
+    choice = BackendChoice(name="anny", params=given)
+    assert choice.params == {"weight": 0.3, "shape": [1, 2]}
+    assert "age" in given
+
+
+def test_options_are_set_once_and_travel():
+    options = ConvertOptions(lod="low", identity=IdentityChoice(method="unpose"))
+    with pytest.raises(FrozenInstanceError, match="lod"):
+        options.lod = "mid"
+    for other in (copy.deepcopy(options), pickle.loads(pickle.dumps(options)), replace(options)):
+        assert other == options
+    assert replace(options, lod="mid").lod is FitLod.mid
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"chunk": 0}, "chunk: got 0, expected at least 1"),
+        ({"betas": [1.0]}, "betas: got .* expected none with to=soma"),
+        ({"to": "smplh", "most_betas": 1}, "most_betas: got 1, expected none with to=smplh"),
+    ],
+)
+def test_what_would_change_nothing_is_refused(changes, said):
+    with pytest.raises(InputError, match=said):
+        ConvertOptions(**changes)
