@@ -123,6 +123,11 @@ class SparseRows(torch.nn.Module):
         """Row starts, column ids and values of its transpose."""
         return self.t_crow, self.t_col, self.t_val
 
+    def scipy(self) -> scipy.sparse.csr_array:
+        """The matrix on the host, in float64."""
+        start, column, value = (part.cpu().numpy() for part in self.csr)
+        return scipy.sparse.csr_array((value.astype(np.float64), column, start), shape=self.shape)
+
     def forward(self, dense: Tensor) -> Tensor:
         """Product with (n, f); (m, f)."""
         return gather_rows(dense, self.csr, self.transpose)

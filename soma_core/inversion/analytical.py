@@ -18,9 +18,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from soma_core.animation.kinematics import joint_levels
 from soma_core.errors import InputError
 from soma_core.geometry.kabsch import rotation_from_covariance
+from soma_core.geometry.tree import joint_levels
 from soma_core.inversion.gauss_newton import GaussNewton
 from soma_core.inversion.moments import RestMoments
 from soma_core.inversion.problem import Pose

@@ -17,13 +17,15 @@ from soma_core.inversion._inputs import check_vertices, check_weights, refuse_tr
 from soma_core.inversion.analytical import AnalyticalOptions
 from soma_core.inversion.autograd import AutogradOptions
 from soma_core.inversion.implicit import attach_gradient
-from soma_core.inversion.ladder import Ladder, LadderOptions, Stage, Targets
+from soma_core.inversion.ladder import Ladder
 from soma_core.inversion.model import PoseModel
 from soma_core.inversion.moments import RestMoments
 from soma_core.inversion.priors import PosePriors, joint_terms, neighbour_mean, twist_doubt, with_references
 from soma_core.inversion.problem import Pose, Problem, part_of
+from soma_core.inversion.refine import clumping
 from soma_core.inversion.result import InversionResult, joined
 from soma_core.inversion.start import cloud_extent
+from soma_core.inversion.targets import LadderOptions, Stage, Targets
 from soma_core.layer import Kernels, SomaLayer
 from soma_core.rig import load_canonical
 from soma_core.skeleton.identity import Identity
@@ -223,7 +225,7 @@ class PoseInversion(Derived):
             view = self.model.view(
                 made, Pose.begin(relative, result.translation[chunk].detach() - made.origin)
             )
-            weight = self.model.clumping(view, made.weights.sum(1).expand(len(known)))
+            weight = clumping(self.model, view, made.weights.sum(1).expand(len(known)))
             return replace(made, doubt=self.doubt.weighed(weight))
 
         rotations, translation = attach_gradient(

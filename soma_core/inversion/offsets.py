@@ -20,9 +20,9 @@ from torch import Tensor
 from soma_core.correctives.model import Correctives
 from soma_core.geometry.rotations import skew
 from soma_core.geometry.sparse import SparseRows
-from soma_core.inversion.gauss_newton import GaussNewton
 from soma_core.inversion.moments import RestMoments
 from soma_core.inversion.problem import Activity
+from soma_core.inversion.skin_equations import SkinEquations
 from soma_core.rig.skeleton import Rig
 
 __all__ = ["PoseOffsets"]
@@ -114,7 +114,7 @@ class PoseOffsets(torch.nn.Module):
         )
         still = np.broadcast_to(np.eye(3)[:, :2], (len(left), 3, 2)).copy()
         still[0] = 0
-        first, second = (_matrix(rows) for rows in (correctives.first, correctives.second))
+        first, second = (rows.scipy() for rows in (correctives.first, correctives.second))
         if some is not None:
             second = second[(3 * some[:, None] + np.arange(3)).ravel()]
         return cls(
@@ -155,7 +155,7 @@ class PoseOffsets(torch.nn.Module):
             block, place = torch.nonzero(self.reads == joint, as_tuple=True)
             reads[self.taken[block].flatten(), which] = self.gate[block, :, place].flatten(0, 1)
         ids = torch.nonzero((reads[:-1] != 0).any(-1).any(-1)).flatten()
-        shapes = _matrix(self.shapes)[:, ids.cpu().numpy()]
+        shapes = self.shapes.scipy()[:, ids.cpu().numpy()]
         counted = scipy.sparse.diags_array(np.repeat(fitted.astype(np.float64), 3)) @ shapes
         values, vectors = np.linalg.eigh((shapes.T @ counted).toarray())
         kept = values > fitted.sum() * _LEAST_MODE**2
@@ -209,18 +209,18 @@ class PoseOffsets(torch.nn.Module):
         relative: Tensor,
         turns: Tensor,
         places: Tensor,
-        solver: GaussNewton,
+        solver: SkinEquations,
         fold: Tensor | None,
         scale: Tensor,
         sizes: tuple[Tensor, Tensor],
     ) -> Tensor:
-        """What to add to the matrix (F, n + 1, 3, n + 1, 3) of :meth:`GaussNewton.normal_equations`.
+        """What to add to the matrix (F, n + 1, 3, n + 1, 3) of :meth:`SkinEquations.normal_equations`.
 
         Args:
             activity, relative: of the pose.
             turns, places: of all joints.
             solver: whose variables the matrix has.
-            fold: of :meth:`GaussNewton.fold`; None without driven joints.
+            fold: of :meth:`SkinEquations.fold`; None without driven joints.
             scale: (F,) size of the bodies; moments are those of the canonical one.
             sizes: of :meth:`sizes`.
         """
@@ -255,7 +255,7 @@ class PoseOffsets(torch.nn.Module):
         self,
         turns: Tensor,
         places: Tensor,
-        solver: GaussNewton,
+        solver: SkinEquations,
         fold: Tensor | None,
         sizes: tuple[Tensor, Tensor],
     ) -> Tensor:
@@ -275,11 +275,6 @@ class PoseOffsets(torch.nn.Module):
 def _paired(rows: Tensor) -> Tensor:
     """Rows of frames, of a lone one twice: sums over one column alone run in another order (PyTorch 2.13)."""
     return rows.expand(2, -1) if len(rows) == 1 else rows
-
-
-def _matrix(rows: SparseRows) -> scipy.sparse.csr_array:
-    start, column, value = (part.cpu().numpy() for part in rows.csr)
-    return scipy.sparse.csr_array((value.astype(np.float64), column, start), shape=rows.shape)
 
 
 def _blocks(

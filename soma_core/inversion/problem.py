@@ -120,6 +120,11 @@ class Activity:
     before: Tensor | None = None
     slope: Tensor | None = None
 
+    @property
+    def rising(self) -> Tensor:
+        """The slopes, of ones where activations are what goes into them."""
+        return torch.ones_like(self.value) if self.slope is None else self.slope
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class View:

@@ -10,6 +10,7 @@ from torch import Tensor
 from soma_core.inversion.gauss_newton import GaussNewton
 from soma_core.inversion.priors import TwistDoubt
 from soma_core.inversion.problem import Pose, Problem, View
+from soma_core.inversion.structure import MomentStructure
 
 __all__ = ["Curvature", "ForwardModel"]
 
@@ -43,7 +44,10 @@ class ForwardModel(Protocol):
 
     Attributes:
         solver: of its poses.
+        structure: which vertices it moves, and with which weights.
     """
+
+    structure: MomentStructure
 
     @property
     def solver(self) -> GaussNewton:
@@ -51,10 +55,6 @@ class ForwardModel(Protocol):
 
     def view(self, problem: Problem, pose: Pose, bound: Tensor | None = None) -> View:
         """Error of poses, and its exact derivative; residuals beyond `bound` (F,) [m] count linearly."""
-
-    def clumping(self, view: View, mass: Tensor) -> Tensor:
-        """How far what is left of each frame is of one piece, (F,)."""
-        ...
 
     def inverse(
         self, problem: Problem, pose: Pose, view: View, damping: Tensor, mass: Tensor

@@ -11,8 +11,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from soma_core.animation.kinematics import joint_levels
 from soma_core.geometry.rotations import skew
+from soma_core.geometry.tree import joint_levels
 from soma_core.inversion.driven import DrivenJoints
 from soma_core.inversion.moments import RestMoments
 from soma_core.inversion.problem import Pose

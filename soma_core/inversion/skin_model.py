@@ -43,11 +43,6 @@ _INDEFINITE = 1e15
 """A variance [rad^2/m^2] that no ridge lets through: the factorisation met a pivot that is not positive."""
 
 
-_PIECE = 1 / 225
-"""Share of the vertices that miss their targets together where another rig posed the mesh: at least this, on
-meshes of Anny's own rig and people from infant to old."""
-
-
 class Kind(TypedDict):
     """What constants are kept as."""
 
@@ -97,7 +92,6 @@ class SkinModel(torch.nn.Module):
             structure, public_count=self.solver.public_count, limbs=limbs, warp=warp, **kind
         )
         self._warp, self._kind, self._skin = warp, kind, rig.weights
-        self._squares = float((structure.influence_weight**2).sum())
         self._steps = self._step_kernels() if self.solver.kernels is not None else None
         orient = rig.t_pose_world[:, :3, :3].copy()
         orient[0] = np.eye(3)
@@ -202,7 +196,7 @@ class SkinModel(torch.nn.Module):
         assert found.forces is not None
         assert rest.bind is not None
         if self._steps is not None:
-            rising = None if activity is None else _rising(activity)
+            rising = None if activity is None else activity.rising
             return self._steps.slopes(
                 self._constants(rest), pose.relative, pose.translation, found.forces, found.pull, rising
             )
@@ -347,7 +341,7 @@ class SkinModel(torch.nn.Module):
         assert self._steps is not None
         slope = scale = None
         if activity is not None:
-            slope, scale = _rising(activity), self.scale(problem).expand(len(mass))
+            slope, scale = activity.rising, self.scale(problem).expand(len(mass))
         return self._steps.factorise(
             self._constants(problem.rest), pose.relative, pose.translation, damping, mass, slope, scale,
             stiffness=HINGE_STIFFNESS, soft=self.solver.soft(problem.terms, pose.translation),
@@ -375,7 +369,7 @@ class SkinModel(torch.nn.Module):
         mass: Tensor,
     ) -> Tensor:
         """Matrix (F, n + 1, 3, n + 1, 3) of the model and the terms."""
-        matrix = self._matrix(problem, pose, turns, places, activity)
+        matrix = self.matrix(problem, pose, turns, places, activity)
         if problem.terms is not None:
             slope = torch.zeros_like(matrix[:, 0, 0])
             self.solver.add_terms(matrix, slope, pose.relative, turns, problem.terms, mass)
@@ -385,13 +379,10 @@ class SkinModel(torch.nn.Module):
         """The exact curvature of the error at poses."""
         return SkinCurvature(self, problem, pose)
 
-    def matrix(self, problem: Problem, pose: Pose, view: View) -> Tensor:
-        """Gauss-Newton matrix (F, n + 1, 3, n + 1, 3) of the whole model at a pose."""
-        return self._matrix(problem, pose, view.turns, view.places, view.activity)
-
-    def _matrix(
+    def matrix(
         self, problem: Problem, pose: Pose, turns: Tensor, places: Tensor, activity: Activity | None
     ) -> Tensor:
+        """Gauss-Newton matrix (F, n + 1, 3, n + 1, 3) of the whole model at a pose."""
         matrix, _ = self.solver.normal_equations(turns, places, problem.rest)
         if self.offsets is None or activity is None:
             return matrix
@@ -402,22 +393,6 @@ class SkinModel(torch.nn.Module):
             activity, pose.relative, turns, places, self.solver, fold, scale, sizes
         )
 
-    def clumping(self, view: View, mass: Tensor) -> Tensor:
-        """How far what is left of a frame is of one piece, (F,): 1 for another rig's skin, near 0 for noise.
-
-        Vertices that miss their targets each on its own leave forces on the joints' clouds that cancel; those
-        that miss them together, since another rig moved them, do not.
-        """
-        forces = view.residual[..., 3].square().sum((1, 2))
-        alone = self._squares * view.energy / mass
-        pieces = forces / alone.clamp_min(torch.finfo(alone.dtype).tiny)
-        return (pieces / (_PIECE * len(self.fitted))).clamp_max(1)
-
     def scale(self, problem: Problem) -> Tensor:
         """Size of the bodies beside the canonical one, (1 or F,)."""
         return problem.origin.new_ones(1)
-
-
-def _rising(activity: Activity) -> Tensor:
-    """Slopes (F, C) of activations."""
-    return torch.ones_like(activity.value) if activity.slope is None else activity.slope

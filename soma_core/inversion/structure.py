@@ -51,6 +51,15 @@ class MomentStructure:
                 step = self.parents[step]
         return above
 
+    def meeting(self) -> dict[int, list[int]]:
+        """Joint -> weighted joints that it shares vertices with, itself included."""
+        near: dict[int, list[int]] = {}
+        for first, second in self.joints[self.pairs].tolist():
+            near.setdefault(first, []).append(second)
+            if first != second:
+                near.setdefault(second, []).append(first)
+        return near
+
 
 def skin_structure(rig: Rig, fitted: np.ndarray) -> MomentStructure:
     """Collect the influences on `fitted` vertices, by joint, and the vertices each two joints share.

@@ -96,7 +96,7 @@ class _Twists:
         self.mix = mix
         self.chains = [[int(j) for j in np.flatnonzero(row) if int(j) in free] for row in chain]
         self.counts = {"channel_count": mix.shape[1] if driven else 0, "helper_count": len(mix)}
-        self.near = _meeting(structure)
+        self.near = structure.meeting()
         self.first = 0 if driven is None else driven.public_count
         self.rows = [self._rows(channel) for channel in range(self.counts["channel_count"])]
 
@@ -328,11 +328,8 @@ class _Modes:
         offsets = self.offsets
         assert offsets is not None
         width, count = 3 * offsets.columns, len(offsets.left)
-        if offsets.first is None:
-            rows = scipy.sparse.eye_array(width * count, format="csr")
-        else:
-            start, column, value = (part.cpu().numpy() for part in offsets.first.csr)
-            rows = scipy.sparse.csr_array((value.astype(np.float64), column, start), offsets.first.shape)
+        first = offsets.first
+        rows = scipy.sparse.eye_array(width * count).tocsr() if first is None else first.scipy()
         used = np.unique(rows.indices // width)
         place = np.full(count, -1)
         place[used] = np.arange(len(used))
@@ -386,16 +383,6 @@ class _Modes:
             for c in np.flatnonzero(mix[i - first])
             for j in np.flatnonzero(chain[c]) if int(j) in self.free
         ]  # fmt: skip
-
-
-def _meeting(structure: MomentStructure) -> dict[int, list[int]]:
-    """Joint -> weighted joints that it shares vertices with, itself included."""
-    near: dict[int, list[int]] = {}
-    for first, second in structure.joints[structure.pairs].tolist():
-        near.setdefault(first, []).append(second)
-        if first != second:
-            near.setdefault(second, []).append(first)
-    return near
 
 
 def _starts(lists: Sequence[Sequence]) -> np.ndarray:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -11,10 +11,8 @@ from torch import Tensor
 from soma_core.inversion.model import PoseModel
 from soma_core.inversion.priors import JointTerms
 from soma_core.inversion.problem import Pose, Problem
-from soma_core.inversion.refine import Refinement
-
-if TYPE_CHECKING:
-    from soma_core.inversion.ladder import LadderOptions, Targets
+from soma_core.inversion.refine import Refinement, clumping
+from soma_core.inversion.targets import LadderOptions, Targets
 
 __all__ = ["WholeFit"]
 
@@ -111,7 +109,7 @@ class WholeFit:
             return pose
         view = self.coarse.view(problem, pose, None if clip is None else clip.bound)
         mass = problem.weights.sum(1).expand(len(view.energy))
-        weight = self.coarse.clumping(view, mass)
+        weight = clumping(self.coarse, view, mass)
         view = replace(view, energy=weight * (view.energy if clip is None else mass * clip.typical.square()))
         scale = self.coarse.scale(problem).expand(len(pose.translation))
         n = self.coarse.solver.variables

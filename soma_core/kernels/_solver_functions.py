@@ -17,6 +17,14 @@ __all__ = ["Task", "solver_functions"]
 _ids = wp.array(dtype=wp.int32)
 
 
+_BARE = {
+    "assemble": matrix.ASSEMBLE, "twists": matrix.TWISTS, "modes": matrix.MODES, "factor": matrix.FACTOR,
+    "forces": text.FORCES, "solve": text.SOLVE, "selected": variance.SELECTED, "keep": view.KEEP,
+    "transform": view.TRANSFORM, "activate": view.ACTIVATE, "pull": view.PULL, "turn": view.TURN,
+}  # fmt: skip
+"""Bodies that take nothing but the lists and the memory."""
+
+
 @functools.cache
 def solver_functions(scalar: str, lanes: int, *, shared: bool) -> SimpleNamespace:
     real = wp.array(dtype=getattr(wp, scalar))
@@ -32,20 +40,6 @@ def solver_functions(scalar: str, lanes: int, *, shared: bool) -> SimpleNamespac
     def change(plan: _ids, numbers: real, k: real, s: real, f: real, begin: int): ...
 
     def copy(plan: _ids, numbers: real, k: real, s: real, f: real, forced: int): ...
-
-    def assemble(plan: _ids, numbers: real, k: real, s: real, f: real): ...
-
-    def twists(plan: _ids, numbers: real, k: real, s: real, f: real): ...
-
-    def forces(plan: _ids, numbers: real, k: real, s: real, f: real): ...
-
-    def modes(plan: _ids, numbers: real, k: real, s: real, f: real): ...
-
-    def factor(plan: _ids, numbers: real, k: real, s: real, f: real): ...
-
-    def solve(plan: _ids, numbers: real, k: real, s: real, f: real): ...
-
-    def selected(plan: _ids, numbers: real, k: real, s: real, f: real): ...
 
     def terms(
         plan: _ids, numbers: real, k: real, s: real, f: real, softs: _ids, stiffs: real, reference: real,
@@ -68,29 +62,19 @@ def solver_functions(scalar: str, lanes: int, *, shared: bool) -> SimpleNamespac
         count: int,
     ): ...  # fmt: skip
 
-    def keep(plan: _ids, numbers: real, k: real, s: real, f: real): ...
-
-    def transform(plan: _ids, numbers: real, k: real, s: real, f: real): ...
-
-    def activate(plan: _ids, numbers: real, k: real, s: real, f: real): ...
-
-    def pull(plan: _ids, numbers: real, k: real, s: real, f: real): ...
-
-    def turn(plan: _ids, numbers: real, k: real, s: real, f: real): ...
-
     def root_turn(plan: _ids, numbers: real, k: real, s: real, f: real, damping_start: number): ...
 
     bodies = {
         "walk": (text.WALK, walk), "change": (text.CHANGE, change), "copy": (text.BEGIN, copy),
-        "assemble": (matrix.ASSEMBLE, assemble), "twists": (matrix.TWISTS, twists),
-        "forces": (text.FORCES, forces),
-        "modes": (matrix.MODES, modes), "factor": (matrix.FACTOR, factor), "solve": (text.SOLVE, solve),
         "terms": (text.TERMS, terms), "move": (text.MOVE, move), "accept": (text.ACCEPT, accept),
-        "transform": (view.TRANSFORM, transform), "activate": (view.ACTIVATE, activate),
-        "keep": (view.KEEP, keep), "doubt": (view.DOUBT, doubt), "pull": (view.PULL, pull),
-        "turn": (view.TURN, turn),
-        "still": (text.STILL, root_turn), "selected": (variance.SELECTED, selected),
+        "still": (text.STILL, root_turn), "doubt": (view.DOUBT, doubt),
     }  # fmt: skip
+    for name, body in _BARE.items():
+
+        def stub(plan: _ids, numbers: real, k: real, s: real, f: real): ...
+
+        stub.__name__ = name
+        bodies[name] = body, stub
     return SimpleNamespace(**{name: made(*given) for name, given in bodies.items()})
 
 

@@ -70,8 +70,7 @@ class ModelResidual(torch.nn.Module):
         skin = scipy.sparse.csr_array((value.astype(np.float64), joint, start), shape=(vertices, joints))
         moves = scipy.sparse.csr_array((3 * vertices, 0))
         if correctives is not None:
-            start, active, value = (part.cpu().numpy() for part in correctives.csr)
-            moves = scipy.sparse.csr_array((value.astype(np.float64), active, start), shape=correctives.shape)
+            moves = correctives.scipy()
         self.vertex_count, self.activation_count, self.joint_count = vertices, moves.shape[1], joints
         if warp:
             from soma_core.kernels.model_residual_wp import residual_tables

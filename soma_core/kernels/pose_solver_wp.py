@@ -19,7 +19,7 @@ from soma_core.kernels._native import transposing
 from soma_core.kernels._runtime import as_warp, launching, scalar_name
 from soma_core.kernels._solver_functions import Task, solver_functions
 from soma_core.kernels._solver_layout import COUNTS, EXTRA, LISTS, NUMBERS, slot_sizes
-from soma_core.kernels.pose_steps_wp import factor_kernel, solution_kernels, tree_kernels
+from soma_core.kernels.pose_steps_wp import factor_kernel, solution_kernels, step_kernels, tree_kernels
 
 __all__ = ["Factor", "PoseSolver", "Soft"]
 
@@ -243,7 +243,8 @@ class PoseSolver:
         none = relative.new_zeros(1)
         softs = torch.zeros(1, dtype=torch.int32, device=relative.device)
         self._launch(
-            self._tree(relative, constants).moved, constants[0], relative,
+            step_kernels(scalar_name(relative.dtype), lane_count(relative), shared=constants[1]).moved,
+            constants[0], relative,
             (as_warp(softs), as_warp(none), longest, *map(as_warp, given)), task={"hinge_end": self.driven},
         )  # fmt: skip
         return outputs
@@ -268,7 +269,7 @@ class PoseSolver:
             turns.contiguous(), share, slope,
         )  # fmt: skip
         self._launch(
-            tree_kernels(scalar_name(relative.dtype), lanes, shared=True).doubted, relative.new_zeros(1, 1),
+            step_kernels(scalar_name(relative.dtype), lanes, shared=True).doubted, relative.new_zeros(1, 1),
             relative, tuple(map(as_warp, given)), task={"soft_count": len(columns)},
         )  # fmt: skip
         return share, _ascending(slope)

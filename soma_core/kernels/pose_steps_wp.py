@@ -1,4 +1,4 @@
-"""Single steps of the pose solver in Warp: the tree, slopes, and the factorised matrix of the whole model."""
+"""Single steps of the pose solver in Warp: the tree, slopes, the whole model's matrix, and what it solves."""
 
 import functools
 from types import SimpleNamespace
@@ -8,7 +8,7 @@ import warp as wp
 from soma_core.kernels._native import transposing
 from soma_core.kernels._solver_functions import Task, solver_functions
 
-__all__ = ["factor_kernel", "solution_kernels", "tree_kernels"]
+__all__ = ["factor_kernel", "solution_kernels", "step_kernels", "tree_kernels"]
 
 _ids = wp.array(dtype=wp.int32)
 
@@ -47,7 +47,6 @@ def tree_kernels(scalar: str, lanes: int, *, shared: bool) -> SimpleNamespace:
     real, rows = wp.array(dtype=number), wp.array2d(dtype=number)
     body, width = solver_functions(scalar, lanes, shared=shared), lanes
     forces, transform, activate, pull, turn = body.forces, body.transform, body.activate, body.pull, body.turn
-    move, keep, doubt = body.move, body.keep, body.doubt
     (load, store), enter = transposing(scalar, lanes), _enter(scalar, lanes, shared=shared)
     module = wp.get_module(f"soma_pose_tree_{scalar}_{lanes}_{'one' if shared else 'each'}")
 
@@ -91,6 +90,19 @@ def tree_kernels(scalar: str, lanes: int, *, shared: bool) -> SimpleNamespace:
             turn(plan, numbers, k, s, m)
             store(s, at[16], at[17], slope, wp.int64(at[17]), 0, f, last)
 
+    return SimpleNamespace(posed=posed, slopes=slopes)
+
+
+@functools.cache
+def step_kernels(scalar: str, lanes: int, *, shared: bool) -> SimpleNamespace:
+    """Poses after a step, and the doubt of twists."""
+    number = getattr(wp, scalar)
+    real, rows = wp.array(dtype=number), wp.array2d(dtype=number)
+    body, width = solver_functions(scalar, lanes, shared=shared), lanes
+    move, keep, doubt = body.move, body.keep, body.doubt
+    (load, store), enter = transposing(scalar, lanes), _enter(scalar, lanes, shared=shared)
+    module = wp.get_module(f"soma_pose_step_{scalar}_{lanes}_{'one' if shared else 'each'}")
+
     @wp.kernel(module=module, enable_backward=False)
     def moved(
         task: Task, plan: _ids, numbers: real, constants: rows, memory: rows, kept: rows, at: _ids,
@@ -125,7 +137,7 @@ def tree_kernels(scalar: str, lanes: int, *, shared: bool) -> SimpleNamespace:
             store(s, at[27], 1, share, wp.int64(1), 0, f, last)
             store(s, at[16], at[17], slope, wp.int64(at[17]), 0, f, last)
 
-    return SimpleNamespace(posed=posed, slopes=slopes, moved=moved, doubted=doubted)
+    return SimpleNamespace(moved=moved, doubted=doubted)
 
 
 @functools.cache

@@ -126,7 +126,10 @@ def test_the_slope_of_the_whole_model_is_that_of_its_vertices(kind):
     slope = columns @ away.flatten()
     bound = DIFFERENCES * float(slope.abs().max())
     torch.testing.assert_close(view.slope.flatten(), slope, atol=bound, rtol=0)
-    matrix, dense = model.matrix(problem, pose, view).reshape(len(columns), -1), columns @ columns.T
+    matrix, dense = (
+        model.matrix(problem, pose, view.turns, view.places, view.activity).reshape(len(columns), -1),
+        columns @ columns.T,
+    )
     torch.testing.assert_close(matrix, matrix.T, atol=EXACT * float(matrix.max()), rtol=0)
     values = scipy.linalg.eigh(matrix.numpy(), dense.numpy(), eigvals_only=True)
     assert CLOSE[0] < values.min()

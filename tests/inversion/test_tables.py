@@ -48,7 +48,8 @@ def test_every_pair_of_joints_that_couples_has_a_slot(kind):
     identity, rotations = layer.identity({"shape": randn(1, 16, seed=1)}), poses(layer, "random")
     problem = problem_of(model, identity, layer.pose(identity, rotations, HIPS).vertices)
     pose = as_pose(rotations, HIPS - problem.origin)
-    matrix = model.matrix(problem, pose, model.view(problem, pose))[0, :-1, :, :-1]
+    view = model.view(problem, pose)
+    matrix = model.matrix(problem, pose, view.turns, view.places, view.activity)[0, :-1, :, :-1]
     size = matrix.abs().amax((1, 3))
     scale = size.diagonal().sqrt()
     bound = LEFT_OUT * scale[:, None] * scale if kind == "whole" else NOTHING * size.max()
