@@ -26,6 +26,7 @@ from soma_core.inversion.refine import clumping
 from soma_core.inversion.result import InversionResult, joined
 from soma_core.inversion.start import cloud_extent
 from soma_core.inversion.targets import LadderOptions, Stage, Targets
+from soma_core.inversion.whole import lopsided
 from soma_core.layer import Kernels, SomaLayer
 from soma_core.rig import load_canonical
 from soma_core.skeleton.identity import Identity
@@ -334,13 +335,16 @@ class PoseInversion(Derived):
         determined = self._determined(extent > _COLLAPSED) & usable[:, None]
         residual = (energy / mass).sqrt()
         resting = self.ladder.options.tolerance if self.ladder.whole is None else _RESTING_SHARE * residual
+        rests = (pose.last_change < resting) | (pose.last_change == 0)
+        if self.ladder.whole is not None and self.ladder.options.robust is None:
+            rests = rests & ~lopsided(error, problem.weights, residual)
         return InversionResult(
             rotations=relative[:, 1:],
             translation=translation,
             vertex_error=error,
             valid=usable,
             determined=determined,
-            converged=((pose.last_change < resting) | (pose.last_change == 0)) & usable,
+            converged=rests & usable,
             iterations=pose.accepted,
             residual=residual.masked_fill(~usable, torch.nan),
             angle_std=self._angle_std(problem, near, energy).masked_fill(~determined, torch.nan),

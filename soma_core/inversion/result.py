@@ -27,8 +27,10 @@ class InversionResult:
         determined: (frames, J - 1) bool; whether the target determines the joint's rotation. False for joints
             without skin weight, without weighted vertices, or whose vertices have collapsed to a point.
         converged: (frames,) bool; a Newton step under the model that was fitted would change the frame by
-            less than a hundredth or so of the error that is left; under plain skinning, the last step no
-            longer lowered the energy noticeably.
+            less than a hundredth or so of the error that is left, and that is not all on few of the
+            vertices, as it is where a limb stopped in a wrong place, or where a few vertices are wrong and
+            `robust` was not asked for. Under plain skinning, the last step no longer lowered the energy
+            noticeably.
         iterations: (frames,) int, accepted steps.
         residual: root mean square of the weighted vertex error [m], (frames,); NaN where not valid.
         angle_std: standard deviation of each joint's own rotation, (frames, J - 1) [degrees]: root mean

@@ -14,7 +14,7 @@ from soma_core.inversion.problem import Pose, Problem
 from soma_core.inversion.refine import Refinement, clumping
 from soma_core.inversion.targets import LadderOptions, Targets
 
-__all__ = ["WholeFit"]
+__all__ = ["WholeFit", "lopsided"]
 
 _ROUNDS, _STEPS = 2, 5
 """How often offsets and limbs' twists are looked at before the descent, and steps on moments after each."""
@@ -34,6 +34,9 @@ _DOUBTFUL = (1e-6, 8e-4)
 """A root mean square error [m] between these is more than rounding and less than noise: such a frame may rest
 in a fold of the correctives beside its minimum, and is tried from further limb twists."""
 
+_LOPSIDED = 0.1
+"""Median over root mean square error: 0.9 where noise is left, above 0.3 on meshes of another rig."""
+
 _TRIED = ((0.2, -0.2), (0.45, -0.45))
 """Those twists, against what was found [rad]: pairs, the second for what the first leaves in doubt."""
 
@@ -43,6 +46,27 @@ class _Clip(NamedTuple):
 
     bound: Tensor
     typical: Tensor
+
+
+def median_distance(distances: Tensor, weights: Tensor) -> Tensor:
+    """About the median (F,) of distances (F, v) of the vertices that count under weights (1 or F, v)."""
+    counted = (weights > 0).expand_as(distances)[:, ::_SAMPLED]
+    some = distances[:, ::_SAMPLED].masked_fill(~counted, torch.nan)
+    return some.nanmedian(1).values.nan_to_num(0.0)
+
+
+def lopsided(distances: Tensor, weights: Tensor, residual: Tensor) -> Tensor:
+    """Whether what is left of frames lies on few of their vertices, (F,): neither noise nor another rig.
+
+    Args:
+        distances: vertex errors (F, v) [m].
+        weights: (1 or F, v).
+        residual: root mean square error (F,) [m].
+    """
+    large = residual > _DOUBTFUL[1]
+    if not bool(large.any()):
+        return large
+    return large & (median_distance(distances, weights) < _LOPSIDED * residual)
 
 
 class WholeFit:
@@ -151,10 +175,7 @@ class WholeFit:
         assert self.options.robust is not None
         distances, _ = model.distances(problem, pose)
         assert distances is not None
-        counted = (problem.weights > 0).expand_as(distances)[:, ::_SAMPLED]
-        typical = (
-            distances[:, ::_SAMPLED].masked_fill(~counted, torch.nan).nanmedian(1).values.nan_to_num(0.0)
-        )
+        typical = median_distance(distances, problem.weights)
         return _Clip(bound=(2 * typical).clamp_min(self.options.robust), typical=typical)
 
     def _descended(self, model: PoseModel, problem: Problem, pose: Pose, clip: _Clip | None) -> Pose:

@@ -194,3 +194,19 @@ def test_the_reference_and_its_twin_agree(layer, identity):
 def test_a_negative_number_of_rounds_is_refused(layer):
     with pytest.raises(InputError, match=r"refreshes: got -1, expected at least 0"):
         PoseInversion(layer, refreshes=-1)
+
+
+@pytest.mark.parametrize(("part", "fine"), [("hand", False), ("everything", True)])
+def test_what_is_left_on_few_vertices_is_no_convergence(layer, identity, inversion, part, fine):
+    """A hand that is elsewhere, and noise everywhere of the same root mean square."""
+    rotations = some_poses(3, spread=0.2)
+    vertices = posed(layer, identity, rotations)
+    hand = torch.as_tensor(layer.rig.weights.toarray()[:, layer.rig.joint_names.index("LeftHand")] > 0.5)
+    assert 20 < hand.sum() < 0.05 * len(hand)
+    away = torch.zeros_like(vertices)
+    away[:, hand] = 0.2 * randn(3, int(hand.sum()), 3, seed=8).float()
+    if part == "everything":
+        away = float(away.square().mean().sqrt()) * randn(*vertices.shape, seed=8).float()
+    result = inversion(vertices + away, identity)
+    assert (result.residual > 0.005).all()
+    assert result.converged.tolist() == [fine] * 3
