@@ -66,21 +66,23 @@ def _waited(vertices: torch.Tensor) -> torch.Tensor:
 
 
 def main_inversion(device: str = "cpu") -> None:
-    from soma_core.evaluation.inversion_runs import method_options
     from soma_core.inversion import PoseInversion
 
     torch.set_num_threads(2)
-    layers = {lod: SomaLayer("anny", lod=lod, device=device, **_SAME_WORK) for lod in ("mid", "low")}
+    layers = {
+        (lod, kind): SomaLayer("anny", lod=lod, device=device, **options)
+        for lod in ("mid", "low") for kind, options in (("plain", _SAME_WORK), ("default", {}))
+    }  # fmt: skip
 
     @torch.no_grad()
     def prepare(case: str, inputs: dict[str, np.ndarray]) -> Work:
-        lod, method = case.split("/")
+        lod, kind = case.split("/")
         values = inputs["phenotypes"][0].tolist()
         params = dict(zip(PHENOTYPES, values, strict=True))
-        layer, inversion = layers[lod], PoseInversion(layers[lod], **method_options(method))
+        layer, inversion = layers[lod, kind], PoseInversion(layers[lod, kind])
         identity = layer.identity(params)
         if "vertices" in inputs:
-            judge, target = layers["mid"], torch.from_numpy(inputs["vertices"]).to(device)
+            judge, target = layers["mid", kind], torch.from_numpy(inputs["vertices"]).to(device)
             given = target[:, torch.as_tensor(layer.mesh.mid_ids.astype(np.int64))].contiguous()
         else:
             judge = layer

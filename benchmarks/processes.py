@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import platform
 import statistics
 import subprocess
@@ -18,10 +19,12 @@ ROOT = HERE.parent
 class Worker:
     """One implementation in a process of its own."""
 
-    def __init__(self, name: str, command: Sequence[str]) -> None:
+    def __init__(self, name: str, command: Sequence[str], *, checkout: str | None = None) -> None:
+        """Start it; with `checkout`, from the sources in that folder."""
         self.name = name
+        where = None if checkout is None else {**os.environ, "PYTHONPATH": checkout}
         self.process = subprocess.Popen(
-            command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, cwd=HERE
+            command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, cwd=HERE, env=where
         )
         self.versions = self._read()["versions"]
         self.peak_mb = 0.0

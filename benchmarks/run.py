@@ -176,6 +176,7 @@ def main() -> None:
     parser.add_argument(
         "--peer-methods", nargs="+", default=PEER_METHODS, choices=PEER_METHODS, help="of pose inversion"
     )
+    parser.add_argument("--earlier", help="another checkout of ours, whose fits are timed beside")
     options = parser.parse_args()
     options.peer_python = str(Path(options.peer_python).absolute())
     with tempfile.TemporaryDirectory() as name:
