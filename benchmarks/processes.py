@@ -22,7 +22,10 @@ class Worker:
     def __init__(self, name: str, command: Sequence[str], *, checkout: str | None = None) -> None:
         """Start it; with `checkout`, from the sources in that folder."""
         self.name = name
-        where = None if checkout is None else {**os.environ, "PYTHONPATH": checkout}
+        where = None
+        if checkout is not None:  # its plugins too
+            sources = [checkout, *map(str, Path(checkout).glob("plugins/*"))]
+            where = {**os.environ, "PYTHONPATH": os.pathsep.join(sources)}
         self.process = subprocess.Popen(
             command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, cwd=HERE, env=where
         )

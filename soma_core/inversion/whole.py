@@ -23,9 +23,9 @@ _KEPT = 8e-3
 """Strength that keeps the joint below an upper arm or a thigh while moments are fitted [m/rad]: far above
 what tells its twist, far below what tells how it bends."""
 
-_RESTING, _RESTING_SHARE = 1.5e-7, 5e-3
+_RESTING, _RESTING_SHARE, _COARSE_SHARE = 1.5e-7, 1e-2, 2e-2
 """A frame rests where a Newton step would change it by less, as a root mean square of its vertices [m], or
-relative to the error that is left."""
+relative to the error that is left; the last while it is looked at on few vertices, whose minimum is another."""
 
 _SAMPLED = 8
 """Every so many vertices have a say in a frame's median residual."""
@@ -181,8 +181,9 @@ class WholeFit:
     def _descended(self, model: PoseModel, problem: Problem, pose: Pose, clip: _Clip | None) -> Pose:
         """Descent on the model."""
         clips = () if clip is None else clip
+        share = _RESTING_SHARE if model is self.model else _COARSE_SHARE
         refinement = Refinement(model, problem, *clips)
-        return refinement(pose, iterations=self.options.refreshes, tolerance=_RESTING, share=_RESTING_SHARE)
+        return refinement(pose, iterations=self.options.refreshes, tolerance=_RESTING, share=share)
 
     def _searched(self, problem: Problem, pose: Pose) -> Pose:
         """Frames that may rest beside their minimum are tried from other limb twists."""
