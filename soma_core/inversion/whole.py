@@ -25,7 +25,7 @@ what tells its twist, far below what tells how it bends."""
 
 _RESTING, _RESTING_SHARE, _COARSE_SHARE = 1.5e-7, 1e-2, 2e-2
 """A frame rests where a Newton step would change it by less, as a root mean square of its vertices [m], or
-relative to the error that is left; the last while it is looked at on few vertices, whose minimum is another."""
+relative to the error that is left; the last on the way, on few vertices, whose minimum is another."""
 
 _SAMPLED = 8
 """Every so many vertices have a say in a frame's median residual."""
