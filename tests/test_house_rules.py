@@ -58,11 +58,6 @@ LISTS = {"soma_core/__init__.py", "soma_core/motion/__init__.py", "soma_core/plu
 # Packages that stand alone: nothing else of the core, whatever its rank.
 ALONE = {"geometry": {"errors"}, "plugin": {"_lazy", "_version", "errors", "paths", "cache"}}
 
-# Circles of imports that stand yet; no other may come.
-KNOWN_CYCLES = [
-    {"soma_core.inversion.curvature", "soma_core.inversion.skin_model"},
-]
-
 TOP_LEVEL = {"soma_core", "plugins", "assets", "configs", "tests", "benchmarks", "docs", ".ci"}
 VAGUE_NAMES = {"utils", "util", "common", "helpers", "misc"}
 HEAVY = {"torch", "warp", "pxr", "trimesh"}
@@ -204,8 +199,7 @@ def test_no_imports_go_in_a_circle() -> None:
     count, label = scipy.sparse.csgraph.connected_components(links, connection="strong")
     names = np.array(list(graph))
     circles = [set(names[label == part].tolist()) for part in range(count) if (label == part).sum() > 1]
-    new = [sorted(circle) for circle in circles if not any(circle <= known for known in KNOWN_CYCLES)]
-    assert not new, f"imports go in a circle: {new}"
+    assert not circles, f"imports go in a circle: {circles}"
     assert not [name for name, others in graph.items() if name in others], "a module imports itself"
 
 

@@ -11,7 +11,7 @@ from __future__ import annotations
 import copy
 from collections.abc import Iterable
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any, Protocol, TypeVar
 
 import torch
 from torch import Tensor
@@ -19,8 +19,11 @@ from torch import Tensor
 from soma_core.geometry.sparse import sparse_product
 
 if TYPE_CHECKING:
-    from soma_core.inversion.problem import Pose, Problem
-    from soma_core.inversion.skin_model import SkinModel
+    from soma_core.geometry.sparse import SparseRows
+    from soma_core.inversion.offsets import PoseOffsets
+    from soma_core.inversion.problem import Activity, Pose, Problem
+    from soma_core.inversion.skin_equations import SkinEquations
+    from soma_core.kernels.model_residual import ModelResidual
 
 __all__ = ["SkinCurvature", "in_float64", "problem_in_float64"]
 
@@ -40,6 +43,34 @@ _FRAMES = 8
 """Frames whose vertices are posed at a time."""
 
 
+class PosedSkin(Protocol):
+    """What curvature asks of a model of skinning and offsets.
+
+    Attributes:
+        solver: the equations of its joints; `offsets`: what poses add to the rest shape; None without.
+        skin: weights (v, T); `residual`: compares poses with targets.
+    """
+
+    solver: SkinEquations
+    offsets: PoseOffsets | None
+
+    @property
+    def skin(self) -> SparseRows: ...
+
+    @property
+    def residual(self) -> ModelResidual: ...
+
+    @property
+    def precise(self) -> PosedSkin:
+        """The same in float64."""
+
+    def posing(
+        self, problem: Problem, turns: Tensor, places: Tensor, activity: Activity | None
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor | None, Tensor | None, Tensor, Tensor]:
+        """What :class:`ModelResidual` takes."""
+        ...
+
+
 class SkinCurvature:
     """Curvature of a model of skinning and offsets at poses, in float64; see :class:`Curvature`.
 
@@ -53,7 +84,7 @@ class SkinCurvature:
         slope: half its derivative (F, n + 1, 3).
     """
 
-    def __init__(self, model: SkinModel, problem: Problem, pose: Pose) -> None:
+    def __init__(self, model: PosedSkin, problem: Problem, pose: Pose) -> None:
         self._model, self._problem = model.precise, problem_in_float64(problem)
         solver, offsets, rest = self._model.solver, self._model.offsets, self._problem.rest
         pose = replace(pose, relative=pose.relative.double(), translation=pose.translation.double())
