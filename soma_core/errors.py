@@ -6,7 +6,17 @@ __all__ = ["AssetError", "InputError", "SomaError"]
 
 
 class SomaError(Exception):
-    """Base of every error that SOMA Core raises on purpose."""
+    """Base of every error that SOMA Core raises on purpose; it can be pickled, as pools do."""
+
+    def __reduce__(self) -> tuple[object, ...]:
+        """Make the error again from its text and what it names."""
+        return _restored, (type(self), self.args, vars(self))
+
+
+def _restored(kind: type[SomaError], args: tuple[object, ...], names: dict[str, object]) -> SomaError:
+    error = kind.__new__(kind, *args)
+    vars(error).update(names)
+    return error
 
 
 class InputError(SomaError, ValueError):

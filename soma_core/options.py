@@ -8,7 +8,9 @@ from __future__ import annotations
 import dataclasses
 from dataclasses import dataclass, field
 from enum import StrEnum
-from typing import Any, get_args, get_type_hints
+from os import PathLike
+from types import UnionType
+from typing import Any, get_args, get_origin, get_type_hints
 
 from soma_core.errors import InputError
 
@@ -145,7 +147,7 @@ class Options:
     They are frozen in effect. A frozen dataclass proper is none that hydra composes upon (omegaconf 2.3).
 
     Raises:
-        InputError: another name than those of the choice.
+        InputError: another name than those of the choice, or a value of another type than the field's.
     """
 
     def __setattr__(self, name: str, value: object) -> None:
@@ -155,12 +157,27 @@ class Options:
         object.__setattr__(self, name, value)
 
     def __post_init__(self) -> None:
-        """Turn the names of closed choices into their members."""
+        """Turn the names of closed choices into their members, and refuse what is of another type."""
         for name, hint in get_type_hints(type(self)).items():
             value = vars(self).get(name)
             for kind in (hint, *get_args(hint)):
                 if isinstance(kind, type) and issubclass(kind, StrEnum) and isinstance(value, str):
-                    object.__setattr__(self, name, _member(name, kind, value))
+                    value = _member(name, kind, value)
+                    object.__setattr__(self, name, value)
+            if name in vars(self) and not _fits(value, hint):
+                kinds = getattr(hint, "__name__", str(hint))
+                got = f"{value!r} ({type(value).__name__})"
+                raise InputError(name, got=got, expected=f"a value of type {kinds}", fix="Correct the value.")
+
+
+def _fits(value: object, hint: Any) -> bool:
+    """Whether a value is of a field's type; whole numbers are numbers, and paths are text."""
+    kinds = get_args(hint) if isinstance(hint, UnionType) else (hint,)
+    for kind in (get_origin(kind) or kind for kind in kinds):
+        wider = {float: (int, float), str: (str, PathLike), list: (list, tuple)}.get(kind, kind)
+        if kind is Any or (isinstance(value, wider) and (kind is bool or not isinstance(value, bool))):
+            return True
+    return False
 
 
 def _member(name: str, kind: type[StrEnum], value: str) -> StrEnum:
@@ -179,6 +196,7 @@ class BackendChoice(Options):
 
     def __post_init__(self) -> None:
         """Leave out what has its default."""
+        super().__post_init__()
         for field_name in ("params", "options"):
             given = vars(self)[field_name].items()
             object.__setattr__(self, field_name, {name: value for name, value in given if value is not None})

@@ -8,9 +8,10 @@ from dataclasses import FrozenInstanceError, replace
 
 import pytest
 
-from soma_core.errors import InputError
+from soma_core.errors import AssetError, InputError
 from soma_core.motion import BackendChoice, ConvertOptions, IdentityChoice, InvertOptions
 from soma_core.options import FitLod, Lod, ModelOptions
+from soma_core.plugin.errors import BrokenBackendError
 
 
 def test_names_become_members_of_their_choice():
@@ -49,3 +50,34 @@ def test_options_are_set_once_and_travel():
 def test_what_would_change_nothing_is_refused(changes, said):
     with pytest.raises(InputError, match=said):
         ConvertOptions(**changes)
+
+
+@pytest.mark.parametrize(
+    ("options", "given", "said"),
+    [
+        (
+            ConvertOptions,
+            {"identity": "unknown"},
+            r"identity: got 'unknown' \(str\), .* IdentityChoice",
+        ),
+        (InvertOptions, {"backend": "anny"}, r"backend: got 'anny' \(str\)"),
+        (InvertOptions, {"chunk": 2.5}, r"chunk: got 2.5 \(float\), expected a value of type int"),
+        (InvertOptions, {"chunk": True}, r"chunk: got True \(bool\)"),
+        (ConvertOptions, {"fps": "abc"}, r"fps: got 'abc' \(str\)"),
+        (BackendChoice, {"name": "anny", "params": None}, r"params: got None \(NoneType\)"),
+    ],
+)
+def test_values_of_another_type_are_refused(options, given, said):
+    with pytest.raises(InputError, match=said):
+        options(**given)
+
+
+def test_errors_travel_between_processes():
+    """With their text and what they name, those of backends too."""
+    for error in (
+        InputError("fps", got=-1, expected="more than 0", fix="Pass 30."),
+        AssetError("a.npz", cause="file is missing", fix="Get it."),
+        BrokenBackendError(who="anny", stage="import", cause="no module", fix="Install it."),
+    ):
+        for again in (pickle.loads(pickle.dumps(error)), copy.copy(error)):
+            assert (type(again), str(again), vars(again)) == (type(error), str(error), vars(error))

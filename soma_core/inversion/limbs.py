@@ -275,7 +275,7 @@ class TwistShare:
         turned = (turn @ relative[:, limb.end, None]).flatten(0, 1)[:, None]  # (F (a + 1), 1, 3, 3)
         first = which[:1]
         one = replace(doubt, variable=first * 0, axis=doubt.axis[first], square=doubt.square[first])
-        share = one.share(turned).view(len(relative), -1)
+        share = one.share(turned).view(len(relative), len(angle) + 1)
         return share[:, :-1] - share[:, -1:]
 
     def _twists(self, limb: _Limb, angle: Tensor, view: View, rest: RestMoments) -> tuple[Tensor, Tensor]:

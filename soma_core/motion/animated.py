@@ -100,13 +100,20 @@ def animate(
         keep: frames whose vertices are returned.
 
     Raises:
-        InputError: absolute rotations that were made for another rig.
+        InputError: absolute rotations that were made for another rig; a frame to keep that there is not.
     """
     if not check_rig(motion, layer.rig.revision):
         _log.info("the motion was made for rig %s; its relative rotations carry over", motion.rig_revision)
     path = _hips_path(layer, identity, motion, translation)
     transforms, helpers, vertices, lowest = [], [], {}, np.inf
     wanted = set(keep or ())
+    if not wanted <= set(range(motion.frame_count)):
+        raise InputError(
+            "keep",
+            got=keep,
+            expected=f"frames from 0 to {motion.frame_count - 1}",
+            fix="Correct the numbers.",
+        )
     for start, posed in _posed_chunks(layer, identity, motion, path):
         transforms.append(posed.transforms.cpu().numpy())
         helpers.append(layer.helper_transforms(identity, posed.transforms).cpu().numpy())

@@ -37,7 +37,14 @@ class FittedChunks:
         if file.is_file():
             refuse_other_settings(folder, json.loads(file.read_text(encoding="utf-8")), plan)
             return
+        for stale in folder.glob("*.npz"):  # nothing says what they were made from
+            stale.unlink()
         atomic_text(file, json.dumps(plan, indent=2) + "\n")
+
+    @property
+    def open(self) -> bool:
+        """Whether the folder still says what its chunks are made from: not once they were joined."""
+        return (self.folder / "settings.json").is_file()
 
     def missing(self) -> list[int]:
         """Numbers of the chunks that are still to be made."""

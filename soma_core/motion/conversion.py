@@ -99,6 +99,11 @@ def convert_folder(
         InputError: no file may hold a motion.
     """
     folder, out = Path(folder).expanduser(), Path(out)
+    if not folder.is_dir():
+        raise InputError(
+            str(folder), got="no folder", expected="one that holds motion files",
+            fix="Correct the path; one file is what convert_file takes.",
+        )  # fmt: skip
     files = [file for file in _files(folder) if not file.is_relative_to(out.resolve())]
     if not files:
         raise InputError(

@@ -173,7 +173,11 @@ def plan_fit(
         SomaError: the backend or the file cannot be used.
         InputError: the file is of this skeleton, and needs no fit.
     """
-    source, out, options = Path(source).expanduser(), Path(out), options or ConvertOptions()
+    source, out = (
+        Path(source).expanduser().resolve(),
+        Path(out).resolve(),
+    )  # another process may stand elsewhere
+    options = options or ConvertOptions()
     layout = "vertices" if isinstance(options, InvertOptions) else _known_layout(source)
     if layout not in FITTED:
         raise InputError(

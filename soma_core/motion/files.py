@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
+from soma_core.errors import InputError
 from soma_core.io.amass import holds_smpl_motion
 from soma_core.io.motion import Motion
 from soma_core.io.motion_files import read_motion, write_motion
@@ -61,12 +62,13 @@ class ResultFiles:
         )
 
 
-def layout_of(path: Path) -> Layout | None:
+def layout_of(path: str | Path) -> Layout | None:
     """Which motion a file holds, told by its keys; None where it holds none.
 
     Raises:
         AssetError: the file is missing, damaged, a git-LFS pointer or no NPZ.
     """
+    path = Path(path).expanduser()
     if path.suffix.lower() == ".parquet":
         return "sam3d"
     with open_npz(path) as fields:
@@ -91,6 +93,10 @@ def read(path: str | Path, *, fps: float | None = None, unit: LengthUnit | str |
         AssetError: the file is missing, damaged, a git-LFS pointer or no NPZ.
         InputError: the layout is unknown, or a key is missing or holds what a motion cannot have.
     """
+    if unit is not None and str(unit) not in METRES:
+        raise InputError(
+            "unit", got=repr(unit), expected=f"one of {', '.join(METRES)}", fix="Correct the name."
+        )
     metres = METRES[str(unit)] if unit else None
     name = next((name for name, length in METRES_PER_UNIT.items() if length == metres), None)
     return read_motion(path, fps=fps, unit=name)

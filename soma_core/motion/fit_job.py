@@ -14,7 +14,7 @@ import numpy as np
 import torch
 
 from soma_core.cache import atomic_text, atomic_write
-from soma_core.errors import SomaError
+from soma_core.errors import InputError, SomaError
 from soma_core.inversion.diagnosis import Diagnosis, diagnose_fit
 from soma_core.io.motion_files import write_motion_parts
 from soma_core.motion.bodies import ShownBody, open_body
@@ -68,12 +68,30 @@ class FitPlan:
         return self.chunks.missing()
 
 
-def fit_chunks(plan: FitPlan, numbers: Sequence[int]) -> None:
-    """Fit some chunks of a plan and store them: what a pool or a cluster maps over.
+def fit_chunks(plan: FitPlan, numbers: Sequence[int] | int) -> None:
+    """Fit some chunks of a plan, or one, and store them: what a pool or a cluster maps over.
+
+    Args:
+        plan: it is not finished yet, and its file is as it was.
+        numbers: of the chunks, such as those of :meth:`FitPlan.missing`.
 
     Raises:
         SomaError: the file, or the backend that it needs, cannot be used here.
+        InputError: the plan is finished, its file was changed, or it has no such chunk.
     """
+    numbers = [numbers] if isinstance(numbers, int) else list(numbers)
+    total = len(plan.chunks.ranges)
+    if not all(0 <= number < total for number in numbers):
+        raise InputError("numbers", got=numbers, expected=f"0 to {total - 1}", fix="Use plan.missing().")
+    if not plan.chunks.open:
+        raise InputError(
+            "plan", got="one that is finished", expected="chunks to fit", fix="Make another by plan_fit."
+        )
+    if plan.source.exists() and fingerprint(plan.source) != plan.settings["content"]:
+        raise InputError(
+            str(plan.source), got="another file than when the fit was planned", expected="the same",
+            fix="Make another plan by plan_fit.",
+        )  # fmt: skip
     body = open_body(plan.source, plan.layout, plan.options)
     with body.posed.sequence:
         FitJob(plan=plan, body=body).fit(numbers)

@@ -72,3 +72,32 @@ def test_what_needs_no_fit_has_no_plan(tmp_path):
     write_motion(motion(), tmp_path / "m.npz")
     with pytest.raises(InputError, match="got the layout soma, expected a body to fit"):
         plan_fit(tmp_path / "m.npz", tmp_path, options=ConvertOptions())
+
+
+def test_a_finished_plan_and_chunks_of_nowhere_are_refused(body, tmp_path):
+    options = InvertOptions(**SETTINGS)
+    plan = plan_fit(body, tmp_path / "plan", options=options)
+    with pytest.raises(InputError, match=r"numbers: got \[3\], expected 0 to 2"):
+        fit_chunks(plan, 3)
+    fit_chunks(plan, 0)
+    finish_fit(plan)
+    with pytest.raises(InputError, match="plan: got one that is finished"):
+        fit_chunks(plan, 0)
+
+
+def test_chunks_without_their_settings_are_made_again(body, tmp_path):
+    options = InvertOptions(**SETTINGS)
+    plan = plan_fit(body, tmp_path / "plan", options=options)
+    fit_chunks(plan, 1)
+    (tmp_path / "plan/chunks/settings.json").unlink()
+    assert plan_fit(body, tmp_path / "plan", options=options).missing() == [0, 1, 2]
+
+
+def test_a_file_that_was_changed_since_is_refused_by_name_in_another_process(body, tmp_path):
+    file = tmp_path / "body.npz"
+    file.write_bytes(body.read_bytes())
+    plan = plan_fit(file, tmp_path / "plan", options=InvertOptions(**SETTINGS))
+    np.savez(file, vertices=np.load(body)["vertices"][::-1])
+    refused = pytest.raises(InputError, match="another file than when the fit was planned")
+    with multiprocessing.get_context("spawn").Pool(1) as pool, refused:
+        pool.apply(fit_chunks, (plan, 0))
