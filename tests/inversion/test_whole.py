@@ -210,3 +210,9 @@ def test_what_is_left_on_few_vertices_is_no_convergence(layer, identity, inversi
     result = inversion(vertices + away, identity)
     assert (result.residual > 0.005).all()
     assert result.converged.tolist() == [fine] * 3
+
+
+def test_no_frames_are_no_mistake(layer, identity, inversion):
+    found = inversion(posed(layer, identity, some_poses(1))[:0], identity)
+    assert found.rotations.shape == (0, 77, 3, 3)
+    assert found.converged.shape == (0,)
