@@ -73,7 +73,8 @@ PUBLIC_NAMES = {
         write_motion write_usd
     """,
     "soma_core.motion": """
-        Animated BackendChoice ConvertOptions Converted FitOptions FitPlan FolderConverted IdentityChoice
+        Animated BackendChoice ConvertOptions Converted FitOptions FitPlan FolderConverted FrameRange
+        IdentityChoice
         InversionChoice InvertOptions Picture animate convert convert_file convert_folder finish_fit
         fit_chunks invert layout_of load_clip plan_fit read stored_identity write
     """,

@@ -35,8 +35,8 @@ _DOUBTFUL = (1e-6, 8e-4)
 in a fold of the correctives beside its minimum, and is tried from further limb twists."""
 
 _LOPSIDED = 0.1
-"""Median over root mean square error: 0.9 where noise is left, 0.19 to 0.47 on meshes of another rig, 0.04 where
-limbs stopped in a wrong place."""
+"""Median over root mean square error: 0.9 where noise is left, 0.19 to 0.47 on meshes of another rig, 0.04
+where limbs stopped in a wrong place."""
 
 _TRIED = ((0.2, -0.2), (0.45, -0.45))
 """Those twists, against what was found [rad]: pairs, the second for what the first leaves in doubt."""

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from soma_core.motion.fit_job import FitPlan, fit_chunks
     from soma_core.motion.identities import stored_identity
     from soma_core.motion.options import ConvertOptions, FitOptions, InvertOptions
-    from soma_core.options import BackendChoice, IdentityChoice, InversionChoice, Picture
+    from soma_core.options import BackendChoice, FrameRange, IdentityChoice, InversionChoice, Picture
 
 __all__ = [
     "Animated",
@@ -27,6 +27,7 @@ __all__ = [
     "FitOptions",
     "FitPlan",
     "FolderConverted",
+    "FrameRange",
     "IdentityChoice",
     "InversionChoice",
     "InvertOptions",
@@ -54,7 +55,7 @@ _HOMES = {
     "soma_core.motion.fit_job": ["FitPlan", "fit_chunks"],
     "soma_core.motion.identities": ["stored_identity"],
     "soma_core.motion.options": ["ConvertOptions", "FitOptions", "InvertOptions"],
-    "soma_core.options": ["BackendChoice", "IdentityChoice", "InversionChoice", "Picture"],
+    "soma_core.options": ["BackendChoice", "FrameRange", "IdentityChoice", "InversionChoice", "Picture"],
 }
 
 __getattr__, __dir__ = lazy_names(__name__, _HOMES)
