@@ -2,13 +2,14 @@
 
 Warp runs a CPU kernel one thread after the other, and its compiler does not vectorise over threads. So a
 thread takes a group of frames, and every number is a vector with one entry a frame: the compiler turns each
-operation into one SIMD instruction. On a GPU a group is one frame.
+operation into one SIMD instruction. On a GPU a group is one frame, and the memory of the groups of a warp
+lies abreast: their numbers at one place of it are neighbours, which one transaction reads.
 """
 
 import functools
 import itertools
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from types import SimpleNamespace
 
@@ -17,10 +18,17 @@ import torch
 import warp as wp
 from torch import Tensor
 
-__all__ = ["as_lanes", "from_lanes", "in_threads", "lane_count", "lane_types", "to_lanes"]
+from soma_core.kernels._runtime import launching
+
+__all__ = ["ABREAST", "as_lanes", "as_rows", "frame_rows", "from_lanes", "in_threads", "lane_count",
+           "lane_types", "launch", "row_of", "to_lanes", "worker_count", "working_rows"]  # fmt: skip
 
 _CPU_BYTES = 64
 """Width of the widest SIMD register of current CPUs; narrower ones take two or four instructions."""
+
+
+ABREAST = 32
+"""Groups whose memory lies abreast on a GPU: a warp."""
 
 
 def lane_count(tensor: Tensor) -> int:
@@ -118,10 +126,55 @@ def from_lanes(groups: Tensor, count: int, shape: tuple[int, ...]) -> Tensor:
 
 def as_lanes(groups: Tensor, types: SimpleNamespace) -> wp.array:
     """Descriptor of (groups, k, lanes) memory as a two-dimensional array of lane vectors."""
-    assert groups.is_contiguous(), groups.stride()
     rows, lanes = groups.shape[1:]
-    groups = groups.as_strided(groups.shape, (rows * lanes, lanes, 1))  # of one lane the stride may be any
+    assert lanes == 1 or groups.is_contiguous(), groups.stride()
+    if lanes > 1 or groups.is_contiguous():  # of one lane the stride may be any
+        groups = groups.as_strided(groups.shape, (rows * lanes, lanes, 1))
     return wp.from_torch(groups, dtype=types.vec, requires_grad=False, return_ctype=True)
+
+
+def working_rows(like: Tensor, groups: int, size: int, lanes: int) -> Tensor:
+    """Memory of `size` vectors for every group, (tiles, groups abreast, numbers); see :func:`row_of`."""
+    if lanes > 1:
+        return like.new_empty(groups, 1, size * lanes)
+    return like.new_empty(-(-groups // ABREAST), size, ABREAST).transpose(1, 2)
+
+
+def frame_rows(frames: Tensor, lanes: int) -> Tensor:
+    """Numbers of frames (F, k) in the layout of :func:`working_rows`; of one frame, for all groups."""
+    if lanes > 1:
+        return to_lanes(frames, lanes).flatten(1)[:, None]
+    return to_lanes(frames, ABREAST).transpose(1, 2)
+
+
+def worker_count(groups: int, lanes: int) -> int:
+    """Threads of a kernel's launch: one on a CPU, where others run beside it, one a group on a GPU."""
+    return 1 if lanes > 1 else groups
+
+
+def as_rows(rows: Tensor) -> wp.array:
+    """Descriptor of :func:`working_rows`, or of (1, 1, k) for all groups."""
+    return wp.from_torch(rows, requires_grad=False, return_ctype=True)
+
+
+@functools.cache
+def row_of(scalar: str) -> wp.Function:
+    """Function of kernels: a group's part of :func:`working_rows`."""
+    number = getattr(wp, scalar)
+
+    @wp.func
+    def row(rows: wp.array3d(dtype=number), g: int):
+        return rows[wp.min(g // rows.shape[1], rows.shape[0] - 1), g % rows.shape[1]]
+
+    return row
+
+
+def launch(kernel: wp.Kernel, workers: int, inputs: Sequence, like: Tensor) -> None:
+    """Start a kernel where `like` is; on a GPU in blocks of one warp, which spread best."""
+    with launching(like) as device:
+        wp.launch(
+            kernel, dim=workers, inputs=inputs, device=device, block_dim=ABREAST if like.is_cuda else 256
+        )
 
 
 def in_threads(run: Callable[[slice], None], count: int, like: Tensor) -> None:

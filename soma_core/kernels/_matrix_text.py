@@ -14,13 +14,13 @@ ASSEMBLE = """
     for (int n = 0; n < column_count; n++) {
         int u = joint[n];
         for (int e = row_start[n]; e < row_start[n+1]; e++) {
-            V* x = column + 16 * row_joint[e]; for (int c = 0; c < 16; c++) x[c] = zero;
+            M x = column + 16 * row_joint[e]; for (int c = 0; c < 16; c++) x[c] = zero;
         }
-        const V* du = turns + 9 * u;
+        M du = turns + 9 * u;
         for (int e = near_start[n]; e < near_start[n+1]; e++) {
-            int t = near_joint[e]; const C* m = second + 16 * near_pair[e];
+            int t = near_joint[e]; L m = second + 16 * near_pair[e];
             int row = near_flip[e] ? 1 : 4, col = near_flip[e] ? 4 : 1;
-            const V* dt = turns + 9 * t; V* x = column + 16 * t;
+            M dt = turns + 9 * t; M x = column + 16 * t;
             for (int r = 0; r < 3; r++) {
                 V d0 = dt[3*r], d1 = dt[3*r+1], d2 = dt[3*r+2];
                 V x0 = m[0] * d0 + m[row] * d1 + m[2*row] * d2;
@@ -29,17 +29,17 @@ ASSEMBLE = """
                 x[4*r+3] = m[3*col] * d0 + m[3*col+row] * d1 + m[3*col+2*row] * d2;
                 for (int c = 0; c < 3; c++) x[4*r+c] = x0 * du[3*c] + x1 * du[3*c+1] + x2 * du[3*c+2];
             }
-            const C* b = m + 3 * row;
+            L b = m + 3 * row;
             for (int c = 0; c < 3; c++) x[12+c] = b[0] * du[3*c] + b[col] * du[3*c+1] + b[2*col]
                 * du[3*c+2];
             x[15] = zero + b[3*col];
         }
         for (int e = row_start[n]; e < row_start[n+1]; e++) {
-            int i = row_joint[e]; V* x = column + 16 * i;
-            if (row_slot[e] >= 0) { V* b = blocks + 12 * row_slot[e]; for (int c = 0; c < 12;
+            int i = row_joint[e]; M x = column + 16 * i;
+            if (row_slot[e] >= 0) { M b = blocks + 12 * row_slot[e]; for (int c = 0; c < 12;
                 c++) b[c] += x[c]; }
             if (i == 0) { for (int c = 0; c < 4; c++) root[4*n+c] += x[12+c]; continue; }
-            int p = row_parent[e]; V* y = column + 16 * p;
+            int p = row_parent[e]; M y = column + 16 * p;
             for (int r = 0; r < 3; r++) {
                 V shift = places[3*i+r] - places[3*p+r];
                 for (int c = 0; c < 4; c++) y[4*r+c] += x[4*r+c] + shift * x[12+c];
@@ -47,12 +47,12 @@ ASSEMBLE = """
             for (int c = 0; c < 4; c++) y[12+c] += x[12+c];
         }
         if (n < driven_count) {
-            int h = u - joint_count; const R* e = spin_axis + 3 * h; const V* d = turns + 9 * parents[u];
+            int h = u - joint_count; const R* e = spin_axis + 3 * h; M d = turns + 9 * parents[u];
             V a0 = d[0]*e[0] + d[1]*e[1] + d[2]*e[2], a1 = d[3]*e[0] + d[4]*e[1] + d[5]*e[2];
             V a2 = d[6]*e[0] + d[7]*e[1] + d[8]*e[2];
             helper_axis[3*h] = a0; helper_axis[3*h+1] = a1; helper_axis[3*h+2] = a2;
             for (int i = drive_start[n]; i < drive_start[n+1]; i++) {
-                const V* x = column + 16 * drive_row[i]; V* y = twists + 3 * drive_slot[i];
+                M x = column + 16 * drive_row[i]; M y = twists + 3 * drive_slot[i];
                     R m = drive_value[i];
                 V trace = x[0] + x[5] + x[10];
                 y[0] += m * (trace * a0 - x[0] * a0 - x[4] * a1 - x[8] * a2);
@@ -60,8 +60,8 @@ ASSEMBLE = """
                 y[2] += m * (trace * a2 - x[2] * a0 - x[6] * a1 - x[10] * a2);
             }
             for (int i = cross_start[n]; i < cross_start[n+1]; i++) {
-                int f = cross_row[i]; const V* x = column + 16 * f; R m = cross_value[i];
-                const R* g = spin_axis + 3 * (f - joint_count); const V* q = turns + 9 * parents[f];
+                int f = cross_row[i]; M x = column + 16 * f; R m = cross_value[i];
+                const R* g = spin_axis + 3 * (f - joint_count); M q = turns + 9 * parents[f];
                 V b0 = q[0]*g[0] + q[1]*g[1] + q[2]*g[2], b1 = q[3]*g[0] + q[4]*g[1] + q[5]*g[2];
                 V b2 = q[6]*g[0] + q[7]*g[1] + q[8]*g[2];
                 V trace = x[0] + x[5] + x[10];
@@ -69,9 +69,9 @@ ASSEMBLE = """
                     + b1 * (trace * a1 - x[1] * a0 - x[5] * a1 - x[9] * a2)
                     + b2 * (trace * a2 - x[2] * a0 - x[6] * a1 - x[10] * a2));
             }
-            const V* x = column + 12;
+            M x = column + 12;
             for (int i = mix_start[h]; i < mix_start[h+1]; i++) {
-                V* y = twist_force + 3 * mix_channel[i]; R m = mix_value[i];
+                M y = twist_force + 3 * mix_channel[i]; R m = mix_value[i];
                 y[0] += m * (a1 * x[2] - a2 * x[1]); y[1] += m * (a2 * x[0] - a0 * x[2]);
                 y[2] += m * (a0 * x[1] - a1 * x[0]);
             }
@@ -81,17 +81,17 @@ ASSEMBLE = """
             V s0 = places[3*u] - places[3*p], s1 = places[3*u+1] - places[3*p+1],
                 s2 = places[3*u+2] - places[3*p+2];
             for (int e = push_start[n]; e < push_start[n+1]; e++) for (int r = 0; r < 3; r++) {
-                const V* a = blocks + 12 * push_source[e] + 4*r; V* b = blocks + 12 * push_target[e] + 4*r;
+                M a = blocks + 12 * push_source[e] + 4*r; M b = blocks + 12 * push_target[e] + 4*r;
                 V last = a[3];
                 b[0] += a[0] + last * s0; b[1] += a[1] + last * s1; b[2] += a[2] + last * s2; b[3] += last;
             }
-            V m = root[4*n+3]; V* y = root + 4 * above;
+            V m = root[4*n+3]; M y = root + 4 * above;
             y[0] += root[4*n] + m * s0; y[1] += root[4*n+1] + m * s1; y[2] += root[4*n+2] + m * s2;
                 y[3] += m;
         }
     }
     for (int i = 0; i < slot_count; i++) {
-        V* b = blocks + 12 * i; V x = b[0], y = b[5], z = b[10];
+        M b = blocks + 12 * i; V x = b[0], y = b[5], z = b[10];
         b[0] = y + z; b[5] = x + z; b[10] = x + y;
         for (int r = 0; r < 3; r++) for (int c = 0; c < r; c++) {
             V lower = b[4*r+c]; b[4*r+c] = -b[4*c+r]; b[4*c+r] = -lower;
@@ -100,7 +100,7 @@ ASSEMBLE = """
 """
 
 _PLACED = """
-#define PLACE(block, kind, y, g) do { V* b_ = blocks + 12 * (block); \\
+#define PLACE(block, kind, y, g) do { M b_ = blocks + 12 * (block); \\
         if ((kind) == 0) { for (int r = 0; r < 3; r++) for (int c = 0; c < 3; c++) \\
             b_[4*r+c] += (y)[r] * (g)[c] + (g)[r] * (y)[c]; } \\
         else if ((kind) == 1) { for (int r = 0; r < 3; r++) for (int c = 0; c < 3; \\
@@ -113,12 +113,12 @@ TWISTS = (
     _PLACED
     + """
     for (int i = 0; i < add_count; i++) {
-        V half = R(0.5) * twist_pair[add_pair[i]]; const V* g = steer + 3 * add_channel[i];
-            V* y = twists + 3 * add_slot[i];
+        V half = R(0.5) * twist_pair[add_pair[i]]; M g = steer + 3 * add_channel[i];
+            M y = twists + 3 * add_slot[i];
         for (int r = 0; r < 3; r++) y[r] += half * g[r];
     }
     for (int i = 0; i < twist_count; i++) {
-        const V* y = twists + 3 * twist_slot[i]; const V* g = steer + 3 * twist_channel[i];
+        M y = twists + 3 * twist_slot[i]; M g = steer + 3 * twist_channel[i];
         PLACE(twist_block[i], twist_kind[i], y, g);
     }
 """
@@ -131,8 +131,8 @@ MODES = (
     for (int i = 0; i < 9 * column_count; i++) mode_force[i] = zero;
     const int W = 3 * feature_columns;
     for (int i = 0; i < used_count; i++) {
-        int j = used_joint[i]; const V* a = turns + 9 * (parents[j] < 0 ? 0 : parents[j]);
-            const V* x = relative + 9*j;
+        int j = used_joint[i]; M a = turns + 9 * (parents[j] < 0 ? 0 : parents[j]);
+            M x = relative + 9*j;
         const R* l = left + 9*i; const R* d = right + W*i;
         for (int w = 0; w < 3; w++) {
             V k0 = a[3*w], k1 = a[3*w+1], k2 = a[3*w+2], m[9], y[9];
@@ -152,18 +152,18 @@ MODES = (
     for (int p = 0; p < block_count; p++) {
         int reads = read_start[p+1] - read_start[p], size_p = mode_size[p],
             ids = taken_start[p+1] - taken_start[p];
-        V* out = response + response_start[p];
+        M out = response + response_start[p];
         for (int i = 0; i < 3 * size_p * reads; i++) out[i] = zero;
         for (int c = 0; c < ids; c++) {
             V open = activity[taken[taken_start[p] + c]];
             for (int r = 0; r < reads; r++, gates += W) {
-                const V* x = features + 3*W * read_used[read_start[p] + r]; V v0 = zero, v1 = zero,
+                M x = features + 3*W * read_used[read_start[p] + r]; V v0 = zero, v1 = zero,
                     v2 = zero;
                 for (int q = 0; q < W; q++) { v0 += gates[q] * x[q]; v1 += gates[q] * x[W+q];
                     v2 += gates[q] * x[2*W+q]; }
                 v0 *= open; v1 *= open; v2 *= open;
                 for (int m = 0; m < size_p; m++) {
-                    R f = mixed[m*ids+c]; V* y = out + 3 * (m*reads + r);
+                    R f = mixed[m*ids+c]; M y = out + 3 * (m*reads + r);
                     y[0] += f * v0; y[1] += f * v1; y[2] += f * v2;
                 }
             }
@@ -175,14 +175,14 @@ MODES = (
         int rows = mode_row_count[p], size_p = mode_size[p], first = tree_start[p],
             nodes = tree_start[p+1] - first;
         int reads = read_start[p+1] - read_start[p];
-        V* tree = mode_tree; V* y = mode_rows;
+        M tree = mode_tree; M y = mode_rows;
         for (int i = 0; i < 6 * size_p * nodes; i++) tree[i] = zero;
         for (int i = 0; i < 3 * size_p * (rows + 1); i++) y[i] = zero;
         for (int e = cloud_start[p]; e < cloud_start[p+1]; e++) {
-            int node = cloud_tree[e]; const V* d = turns + 9 * tree_joint[first + node];
+            int node = cloud_tree[e]; M d = turns + 9 * tree_joint[first + node];
             V share = zero + shares[cloud_weighted[e]], arm = share * sizes[cloud_weighted[e]];
             for (int m = 0; m < size_p; m++, moment += 6) {
-                V* x = tree + 6 * (size_p * node + m);
+                M x = tree + 6 * (size_p * node + m);
                 for (int r = 0; r < 3; r++) {
                     x[r] += arm * (d[3*r] * moment[0] + d[3*r+1] * moment[1] + d[3*r+2] * moment[2]);
                     x[3+r] += share * (d[3*r] * moment[3] + d[3*r+1] * moment[4] + d[3*r+2] * moment[5]);
@@ -193,17 +193,17 @@ MODES = (
         for (int node = 0; node < nodes; node++) {
             int j = tree_joint[first + node], up = tree_up[first + node], row = tree_row[first + node];
             for (; f < fold_start[p+1] && fold_tree[f] == node; f++) {
-                const V* a = helper_axis + 3 * fold_helper[f]; const V* g = steer + 3 * fold_channel[f];
+                M a = helper_axis + 3 * fold_helper[f]; M g = steer + 3 * fold_channel[f];
                 for (int m = 0; m < size_p; m++) {
-                    const V* x = tree + 6 * (size_p * node + m); V* o = y + 3 * (size_p * fold_row[f] + m);
+                    M x = tree + 6 * (size_p * node + m); M o = y + 3 * (size_p * fold_row[f] + m);
                     V t = fold_value[f] * (a[0] * x[0] + a[1] * x[1] + a[2] * x[2]);
                     for (int r = 0; r < 3; r++) o[r] += t * g[r];
                 }
             }
             int at = j == 0 ? rows : row;
             if (at >= 0) for (int m = 0; m < size_p; m++) {
-                const V* x = tree + 6 * (size_p * node + m) + (j == 0 ? 3 : 0);
-                    V* o = y + 3 * (size_p * at + m);
+                M x = tree + 6 * (size_p * node + m) + (j == 0 ? 3 : 0);
+                    M o = y + 3 * (size_p * at + m);
                 for (int r = 0; r < 3; r++) o[r] += x[r];
             }
             if (up < 0) continue;
@@ -211,7 +211,7 @@ MODES = (
             V s0 = places[3*j] - places[3*q], s1 = places[3*j+1] - places[3*q+1],
                 s2 = places[3*j+2] - places[3*q+2];
             for (int m = 0; m < size_p; m++) {
-                const V* x = tree + 6 * (size_p * node + m); V* o = tree + 6 * (size_p * up + m);
+                M x = tree + 6 * (size_p * node + m); M o = tree + 6 * (size_p * up + m);
                 o[0] += x[0] + s1 * x[5] - s2 * x[4]; o[1] += x[1] + s2 * x[3] - s0 * x[5];
                 o[2] += x[2] + s0 * x[4] - s1 * x[3];
                 o[3] += x[3]; o[4] += x[4]; o[5] += x[5];
@@ -221,23 +221,23 @@ MODES = (
             int b = near_block[e], size_b = mode_size[b], seen = read_start[b+1] - read_start[b];
             for (int m = 0; m < size_p; m++) for (int l = 0; l < size_b; l++) {
                 V h = grams[m*size_b+l] * most;
-                    const V* x = response + response_start[b] + 3*l*seen;
+                    M x = response + response_start[b] + 3*l*seen;
                 for (int r = 0; r < seen; r++) {
-                    V* o = y + 3 * (size_p * into[r] + m);
+                    M o = y + 3 * (size_p * into[r] + m);
                     o[0] += h * x[3*r]; o[1] += h * x[3*r+1]; o[2] += h * x[3*r+2];
                 }
             }
             grams += size_p * size_b; into += seen;
         }
-        const V* a = response + response_start[p];
+        M a = response + response_start[p];
         for (int e = apply_start[p]; e < apply_start[p+1]; e++) {
             V sum[9]; for (int i = 0; i < 9; i++) sum[i] = zero;
-            const V* u = y + 3 * size_p * apply_row[e];
+            M u = y + 3 * size_p * apply_row[e];
             for (int m = 0; m < size_p; m++) {
-                const V* g = a + 3 * (m*reads + apply_read[e]); const V* v = u + 3*m;
+                M g = a + 3 * (m*reads + apply_read[e]); M v = u + 3*m;
                 for (int r = 0; r < 3; r++) for (int c = 0; c < 3; c++) sum[3*r+c] += v[r] * g[c];
             }
-            V* b = blocks + 12 * apply_block[e];
+            M b = blocks + 12 * apply_block[e];
             for (int r = 0; r < 3; r++) for (int c = 0; c < 3; c++) {
                 if (apply_kind[e] == 0) b[4*r+c] += size * (sum[3*r+c] + sum[3*c+r]);
                 else if (apply_kind[e] == 1) b[4*r+c] += size * sum[3*r+c];
@@ -245,9 +245,9 @@ MODES = (
             }
         }
         for (int r = 0; r < reads; r++) {
-            V* t = mode_force + 9 * read_column[read_start[p] + r];
+            M t = mode_force + 9 * read_column[read_start[p] + r];
             for (int m = 0; m < size_p; m++) {
-                const V* g = a + 3 * (m*reads + r); const V* v = y + 3 * (size_p * rows + m);
+                M g = a + 3 * (m*reads + r); M v = y + 3 * (size_p * rows + m);
                 for (int i = 0; i < 3; i++) for (int c = 0; c < 3; c++) t[3*i+c] += size * v[i] * g[c];
             }
         }
@@ -258,22 +258,22 @@ MODES = (
 FACTOR = """
     V whole = zero, mean = zero;
     for (int n = driven_count; n < column_count; n++) {
-        V* x = carry + 9*n; const V* t = root + 4*n;
+        M x = carry + 9*n; M t = root + 4*n;
         if (parent_column[n] < 0) whole += t[3];
-        const V* d = blocks + 12 * block_start[n]; mean += d[0] + d[5] + d[10];
-        const V* more = mode_force + 9*n;
+        M d = blocks + 12 * block_start[n]; mean += d[0] + d[5] + d[10];
+        M more = mode_force + 9*n;
         for (int i = 0; i < 9; i++) x[i] = block_count ? more[i] : zero;
         x[1] += t[2]; x[2] -= t[1]; x[3] -= t[2]; x[5] += t[0]; x[6] += t[1]; x[7] -= t[0];
     }
     for (int i = 0; i < chain_count; i++) {
-        V* x = carry + 9 * chain_column[i]; const V* f = twist_force + 3 * chain_channel[i];
-        const V* g = steer + 3 * chain_channel[i];
+        M x = carry + 9 * chain_column[i]; M f = twist_force + 3 * chain_channel[i];
+        M g = steer + 3 * chain_channel[i];
         for (int r = 0; r < 3; r++) for (int c = 0; c < 3; c++) x[3*r+c] += f[r] * g[c];
     }
     V grow = one + damping[0];
     V ridge = (R(1e-9) / R(3 * (column_count - driven_count) + 3)) * (mean + R(3) * whole);
     for (int n = driven_count; n < column_count; n++) for (int r = 0; r < 3; r++) {
-        V* d = blocks + 12 * block_start[n] + 5*r; d[0] = d[0] * grow + ridge;
+        M d = blocks + 12 * block_start[n] + 5*r; d[0] = d[0] * grow + ridge;
     }
     for (int i = 0; i < 9; i++) last[i] = zero;
     for (int r = 0; r < 3; r++) last[4*r] = whole * grow + ridge;
@@ -291,11 +291,11 @@ FACTOR = """
             + (a)[(wa)*r_+2] * (b)[(wb)*c_+2]; } while (0)
     for (int n = driven_count; n < column_count; n++) {
         int first = block_start[n], stop = block_start[n+1], e = update_start[n];
-        V* d = blocks + 12 * first; V* i = inverse + 3*n;
+        M d = blocks + 12 * first; M i = inverse + 3*n;
         TRIANGLE(d, 4, i);
         V l10 = d[4], l20 = d[8], l21 = d[9];
         for (int q = first + 1; q <= stop; q++) for (int r = 0; r < 3; r++) {
-            V* b = q < stop ? blocks + 12*q + 4*r : carry + 9*n + 3*r;
+            M b = q < stop ? blocks + 12*q + 4*r : carry + 9*n + 3*r;
             V x = b[0] * i[0], y = (b[1] - x * l10) * i[1];
             b[0] = x; b[1] = y; b[2] = (b[2] - x * l20 - y * l21) * i[2];
         }

@@ -4,13 +4,16 @@ Warp's own vectors are structures, which its compiler loads and stores entry by 
 in C++ on clang's vector type is compiled to SIMD instructions, wide vectors split where the processor is
 narrower. The same text serves CUDA with one frame a group, where the vector is a plain number.
 
-A body is the text of one function. In it ``R`` is the number, ``V`` the vector of ``N`` numbers.
+A body is the text of one function. In it ``R`` is the number, ``V`` the vector of ``N`` numbers, ``M`` a
+pointer to vectors in a group's working memory.
 """
 
 import functools
 from collections.abc import Callable
 
 import warp as wp
+
+from soma_core.kernels._lanes import ABREAST
 
 __all__ = ["native", "transposing"]
 
@@ -32,12 +35,28 @@ def native(body: str, scalar: str, lanes: int, stub: Callable) -> wp.Function:
     if lanes > 1:  # aligned like one number: torch gives rows that start anywhere
         vector += f" __attribute__((vector_size({size * lanes}), aligned({size})))"
     root = "__builtin_elementwise_sqrt(" if lanes > 1 else "wp::sqrt("
-    text = f"{{\n{_FUSED}{vector}; constexpr int N = {lanes};\n{body}}}".replace("ROOT(", root)
+    memory = "typedef V* M;" if lanes > 1 else _ABREAST
+    text = f"{{\n{_FUSED}{vector}; constexpr int N = {lanes};\n{memory}\n{body}}}".replace("ROOT(", root)
     # Warp tells functions apart by name and arguments, which are alike for all numbers of lanes.
     stub.__name__ = f"{stub.__name__}_{scalar}_{lanes}"
     stub.__qualname__ = stub.__name__
     return wp.func_native(text)(stub)
 
+
+_ABREAST = f"""
+struct M {{
+    R* p;
+    explicit CUDA_CALLABLE M(R* begin): p(begin) {{}}
+    CUDA_CALLABLE R& operator[](long long i) const {{ return p[i * {ABREAST}]; }}
+    CUDA_CALLABLE R& operator*() const {{ return *p; }}
+    CUDA_CALLABLE M operator+(long long i) const {{ return M(p + i * {ABREAST}); }}
+    CUDA_CALLABLE M operator-(long long i) const {{ return M(p - i * {ABREAST}); }}
+    CUDA_CALLABLE M& operator+=(long long i) {{ p += i * {ABREAST}; return *this; }}
+    CUDA_CALLABLE M operator++(int) {{ M here = *this; p += {ABREAST}; return here; }}
+    CUDA_CALLABLE explicit operator R*() const {{ return p; }}
+}};
+"""
+"""Memory of frames that lie abreast: what neighbours read at once lies together."""
 
 _FUSED = """
 #if defined(__clang__)
@@ -69,6 +88,8 @@ def transposing(scalar: str, lanes: int) -> tuple[wp.Function, wp.Function]:
     ):  # fmt: skip
         ...
 
+    if lanes == 1:
+        return native(_LOAD_ONE, scalar, 1, load), native(_STORE_ONE, scalar, 1, store)
     unit = min(lanes, _BYTES // (4 if scalar == "float32" else 8))
     square = _square(unit) if unit > 1 else ""
     whole = _LOAD_SQUARES.replace("SQUARE", square) if unit > 1 else ""
@@ -97,6 +118,19 @@ def _square(unit: int) -> str:
         step *= 2
     return "\n".join(lines)
 
+
+_LOAD_ONE = """
+    const R* row = source.data + (long long)(first < last ? first : last) * stride + offset;
+    M to = (M)out.data + at;
+    for (int i = 0; i < count; i++) to[i] = row[i];
+"""
+
+_STORE_ONE = """
+    if (first > last) return;
+    M from = (M)values.data + at;
+    R* row = out.data + (long long)first * stride + offset;
+    for (int i = 0; i < count; i++) row[i] = from[i];
+"""
 
 _SQUARE_TYPE = "typedef R S __attribute__((vector_size(sizeof(R) * U), aligned(sizeof(R))));\n"
 

@@ -67,25 +67,25 @@ def phases(scalar: str, lanes: int) -> SimpleNamespace:
     for stub, body in bodies.items():
         name = stub.__name__
         for slot, at in _SLOTS.items():
-            body = body.replace(f"@{slot}", f"((V*)tile.data + {at})")
+            body = body.replace(f"@{slot}", f"((M)tile.data + {at})")
         made[name] = native(body, scalar, lanes, stub)
     return SimpleNamespace(**made)
 
 
 _CLEAR = """
-    V* to = (V*)out.data + at;
+    M to = (M)out.data + at;
     for (int i = 0; i < count; i++) to[i] = V{};
 """
 
 _POINTS = """
-    V* x = @POINT;
+    M x = @POINT;
     for (int i = 3 * first; i < 3 * stop; i++) *x++ = V{} + rest.data[i];
 """
 
 _MOVED = """
-    const V* a = (const V*)active.data;
+    M a = (M)active.data;
     const V scale = *@SCALE;
-    V* x = @POINT;
+    M x = @POINT;
     for (int v = first; v < stop; v++, x += 3) {
         V p = V{}, q = V{}, r = V{};
         for (int e = start.data[v]; e < start.data[v + 1]; e++) {
@@ -102,10 +102,10 @@ _MOVED = """
 """
 
 _RESIDUAL = """
-    const V *transform = (const V*)transforms.data, *origin = @ORIGIN;
-    const V *x = @POINT, *y = @TARGET, *o = @WEIGHT;
+    M transform = (M)transforms.data, origin = @ORIGIN, x = @POINT, y = @TARGET, o = @WEIGHT;
     const V scale = *@SCALE, bound = *@BOUND, zero = V{};
-    V energy = V{}, *r = @PULLED, *back = @BACK, *length = @LENGTH;
+    M r = @PULLED, back = @BACK, length = @LENGTH;
+    V energy = V{};
     for (int v = first; v < stop; v++, x += 3, y += 3, r += 3, back += 3, o++, length++) {
         if (!own && !measured && !(weight.data[v] > 0)) {
             for (int i = 0; i < 3; i++) r[i] = back[i] = V{};
@@ -114,7 +114,7 @@ _RESIDUAL = """
         V m[12];
         for (int k = 0; k < 12; k++) m[k] = V{};
         for (int e = start.data[v]; e < start.data[v + 1]; e++) {
-            const V* t = transform + 12 * joint.data[e];
+            M t = transform + 12 * joint.data[e];
             const R w = value.data[e];
             for (int k = 0; k < 12; k++) m[k] += w * t[k];
         }
@@ -143,8 +143,7 @@ _RESIDUAL = """
 """
 
 _PULL = """
-    const V* g = @BACK;
-    V* to = (V*)out.data;
+    M g = @BACK, to = (M)out.data;
     for (int v = first; v < stop; v++, g += 3) {
         const V x = g[0], y = g[1], z = g[2];
         for (int e = start.data[v]; e < start.data[v + 1]; e++) {
@@ -155,7 +154,7 @@ _PULL = """
 """
 
 _FORCES = """
-    const V *x = @POINT, *r = @PULLED;
+    M x = @POINT, r = @PULLED;
     for (int p = run.data[t]; p < run.data[end]; p++) {
         V f[12];
         for (int k = 0; k < 12; k++) f[k] = V{};
@@ -167,7 +166,7 @@ _FORCES = """
                 f[4 * i + 3] += a;
             }
         }
-        V* to = (V*)out.data + 12 * joint.data[p];
+        M to = (M)out.data + 12 * joint.data[p];
         for (int k = 0; k < 12; k++) to[k] += f[k];
     }
 """

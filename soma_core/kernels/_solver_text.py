@@ -1,7 +1,7 @@
 """Native bodies of the pose solver: walk, change of the energy, slopes, solution, terms, step.
 
 Every body begins with names of all lists and of the memory of one group of frames (:func:`prelude`). ``S`` is
-that memory, ``C`` an identity's constants: numbers where one identity serves all frames, else vectors.
+that memory, ``K`` an identity's constants: numbers where one identity serves all frames, else vectors.
 """
 
 from collections.abc import Sequence
@@ -14,22 +14,21 @@ def prelude(
     kept: Sequence[str], *, shared: bool,
 ) -> str:  # fmt: skip
     """Names for everything that the arrays `plan`, `numbers`, `k` and `s` hold."""
-    lines = [f"typedef {'R' if shared else 'V'} C; const int* P = plan.data; const C* K = (const C*)k.data;"]
-    lines.append("V* S = (V*)s.data; V* F = (V*)f.data; const R* Q = numbers.data;")
+    lines = [f"typedef {'const R*' if shared else 'M'} L; const int* P = plan.data; L K = (L)k.data;"]
+    lines.append("M S = (M)s.data; M F = (M)f.data; const R* Q = numbers.data;")
     at = 0
     for name in counts:
         lines.append(f"const int {name} = P[{at}];")
         at += 1
-    parts = (lists, "const int*", "P"), (numbers, "const R*", "Q"), (slots, "V*", "S"), (kept, "V*", "F")
+    parts = (lists, "const int*", "P"), (numbers, "const R*", "Q"), (slots, "M", "S"), (kept, "M", "F")
     for names, kind, base in parts:
         for name in names:
             lines.append(f"{kind} {name} = {base} + P[{at}];")
             at += 1
-    lines.append("const C* second = K; const C* offsets = K + 16 * pair_count;")
-    lines.append("const C* lefts = offsets + 3 * all_count; const C* rights = lefts + 9 * channel_count;")
-    lines.append("const C* axes = rights + 9 * channel_count;")
-    lines.append("const C* binds = axes + 3 * channel_count; const C* sizes = binds + 12 * all_count;")
-    lines.append("const C* shares = sizes + weighted_count;")
+    lines.append("L second = K; L offsets = K + 16 * pair_count; L lefts = offsets + 3 * all_count;")
+    lines.append("L rights = lefts + 9 * channel_count; L axes = rights + 9 * channel_count;")
+    lines.append("L binds = axes + 3 * channel_count; L sizes = binds + 12 * all_count;")
+    lines.append("L shares = sizes + weighted_count;")
     lines.append("const V zero = V{}; const V one = zero + R(1);")
     return "\n".join(lines) + "\n"
 
@@ -43,17 +42,17 @@ STILL = """
 """
 
 WALK = """
-    V* rel = trial ? trial_relative : relative; V* tr = trial ? trial_turns : turns;
-    V* pl = trial ? trial_places : places; V* hp = trial ? trial_hips : hips;
-    V* st = trial ? trial_steer : steer;
+    M rel = trial ? trial_relative : relative; M tr = trial ? trial_turns : turns;
+    M pl = trial ? trial_places : places; M hp = trial ? trial_hips : hips;
+    M st = trial ? trial_steer : steer;
     for (int j = 1; j < all_count; j++) {
         if (j == joint_count) {
             for (int c = 0; c < channel_count; c++) {
-                const V* a = tr + 9 * channel_reference[c]; const V* b = tr + 9 * channel_joint[c];
+                M a = tr + 9 * channel_reference[c]; M b = tr + 9 * channel_joint[c];
                 V m[9], x[9];
                 for (int r = 0; r < 3; r++) for (int q = 0; q < 3; q++)
                     x[3*r+q] = a[r] * b[q] + a[3+r] * b[3+q] + a[6+r] * b[6+q];
-                const C* l = lefts + 9 * c; const C* d = rights + 9 * c; const C* e = axes + 3 * c;
+                L l = lefts + 9 * c; L d = rights + 9 * c; L e = axes + 3 * c;
                 for (int r = 0; r < 3; r++) for (int q = 0; q < 3; q++)
                     m[3*r+q] = l[r] * x[q] + l[3+r] * x[3+q] + l[6+r] * x[6+q];
                 for (int r = 0; r < 3; r++) for (int q = 0; q < 3; q++)
@@ -95,7 +94,7 @@ WALK = """
                 for (int n = 0; n < N; n++) {
                     ((R*)&sine)[n] = wp::sin(((R*)&angle)[n]); ((R*)&cosine)[n] = wp::cos(((R*)&angle)[n]);
                 }
-                const R* e = spin_axis + 3 * h; V* o = rel + 9 * (joint_count + h); V more = one - cosine;
+                const R* e = spin_axis + 3 * h; M o = rel + 9 * (joint_count + h); V more = one - cosine;
                 for (int r = 0; r < 3; r++) {
                     for (int q = 0; q < 3; q++) o[3*r+q] = (e[r] * e[q]) * more;
                     o[4*r] += cosine;
@@ -104,7 +103,7 @@ WALK = """
                 o[5] -= e[0] * sine; o[6] -= e[1] * sine; o[7] += e[0] * sine;
             }
         }
-        int p = parents[j]; const V* a = tr + 9 * p; const V* b = rel + 9 * j; const C* o = offsets + 3 * j;
+        int p = parents[j]; M a = tr + 9 * p; M b = rel + 9 * j; L o = offsets + 3 * j;
         for (int r = 0; r < 3; r++) {
             V a0 = a[3*r], a1 = a[3*r+1], a2 = a[3*r+2];
             for (int c = 0; c < 3; c++) tr[9*j+3*r+c] = a0 * b[c] + a1 * b[3+c] + a2 * b[6+c];
@@ -125,14 +124,14 @@ CHANGE = """
     }
     for (int i = 0; i < 12 * weighted_count; i++) product[i] = zero;
     for (int n = 0; n < pair_count; n++) {
-        int t = pairs[2*n], u = pairs[2*n+1]; const C* m = second + 16 * n;
+        int t = pairs[2*n], u = pairs[2*n+1]; L m = second + 16 * n;
         for (int r = 0; r < 3; r++) {
-            const V* x = change + 12*t + 4*r; V* y = product + 12*u + 4*r;
+            M x = change + 12*t + 4*r; M y = product + 12*u + 4*r;
             for (int c = 0; c < 4; c++) y[c] += m[c] * x[0] + m[4+c] * x[1] + m[8+c] * x[2] + m[12+c]
                 * x[3];
         }
         if (t != u) for (int r = 0; r < 3; r++) {
-            const V* x = change + 12*u + 4*r; V* y = product + 12*t + 4*r;
+            M x = change + 12*u + 4*r; M y = product + 12*t + 4*r;
             for (int c = 0; c < 4; c++)
                 y[c] += m[4*c] * x[0] + m[4*c+1] * x[1] + m[4*c+2] * x[2] + m[4*c+3] * x[3];
         }
@@ -156,7 +155,7 @@ FORCES = """
     for (int i = 0; i < 9 * all_count; i++) spread[i] = zero;
     for (int i = 0; i < 3 * all_count; i++) force[i] = zero;
     for (int t = 0; t < weighted_count; t++) {
-        int j = weighted[t]; const V* d = turns + 9*j; const V* x = residual + 12*t;
+        int j = weighted[t]; M d = turns + 9*j; M x = residual + 12*t;
         for (int r = 0; r < 3; r++) {
             force[3*j+r] = x[4*r+3];
             for (int c = 0; c < 3; c++)
@@ -170,20 +169,20 @@ FORCES = """
             for (int c = 0; c < 3; c++) spread[9*p+3*r+c] += spread[9*j+3*r+c] + shift * force[3*j+c];
         }
         for (int r = 0; r < 3; r++) force[3*p+r] += force[3*j+r];
-        const V* x = spread + 9*j;
+        M x = spread + 9*j;
         slope[3*n] = x[5] - x[7]; slope[3*n+1] = x[6] - x[2]; slope[3*n+2] = x[1] - x[3];
     }
     for (int r = 0; r < 3; r++) slope[3*column_count+r] = force[r];
     for (int c = 0; c < channel_count; c++) twist[c] = zero;
     for (int n = 0; n < driven_count; n++) {
         int h = joint[n] - joint_count; const R* e = spin_axis + 3*h;
-            const V* d = turns + 9 * parents[joint[n]];
+            M d = turns + 9 * parents[joint[n]];
         V torque = zero;
         for (int r = 0; r < 3; r++) torque += slope[3*n+r] * (d[3*r]*e[0] + d[3*r+1]*e[1] + d[3*r+2]*e[2]);
         for (int i = mix_start[h]; i < mix_start[h+1]; i++) twist[mix_channel[i]] += mix_value[i] * torque;
     }
     for (int i = 0; i < chain_count; i++) {
-        V* y = slope + 3 * chain_column[i]; const V* g = steer + 3 * chain_channel[i];
+        M y = slope + 3 * chain_column[i]; M g = steer + 3 * chain_channel[i];
             V t = twist[chain_channel[i]];
         for (int r = 0; r < 3; r++) y[r] += t * g[r];
     }
@@ -191,28 +190,28 @@ FORCES = """
 
 SOLVE = """
     for (int n = driven_count; n < column_count; n++) {
-        const V* d = blocks + 12 * block_start[n]; const V* i = inverse + 3*n; V* x = slope + 3*n;
+        M d = blocks + 12 * block_start[n]; M i = inverse + 3*n; M x = slope + 3*n;
         V y0 = x[0] * i[0], y1 = (x[1] - d[4] * y0) * i[1], y2 = (x[2] - d[8] * y0 - d[9] * y1) * i[2];
         x[0] = y0; x[1] = y1; x[2] = y2;
         for (int q = block_start[n] + 1; q <= block_start[n+1]; q++) {
             bool own = q < block_start[n+1];
-            V* o = slope + 3 * (own ? block_row[q] : column_count);
-                const V* b = own ? blocks + 12*q : carry + 9*n;
+            M o = slope + 3 * (own ? block_row[q] : column_count);
+                M b = own ? blocks + 12*q : carry + 9*n;
             int w = own ? 4 : 3;
             for (int r = 0; r < 3; r++) o[r] -= b[w*r] * y0 + b[w*r+1] * y1 + b[w*r+2] * y2;
         }
     }
-    V* t = slope + 3 * column_count; const V* i = inverse + 3 * column_count;
+    M t = slope + 3 * column_count; M i = inverse + 3 * column_count;
     V t0 = t[0] * i[0], t1 = (t[1] - last[3] * t0) * i[1], t2 = (t[2] - last[6] * t0 - last[7] * t1) * i[2];
     t2 = t2 * i[2]; t1 = (t1 - last[7] * t2) * i[1]; t0 = (t0 - last[3] * t1 - last[6] * t2) * i[0];
     t[0] = t0; t[1] = t1; t[2] = t2;
     for (int n = column_count - 1; n >= driven_count; n--) {
-        const V* d = blocks + 12 * block_start[n]; const V* v = inverse + 3*n; V* x = slope + 3*n;
+        M d = blocks + 12 * block_start[n]; M v = inverse + 3*n; M x = slope + 3*n;
         V z0 = x[0], z1 = x[1], z2 = x[2];
         for (int q = block_start[n] + 1; q <= block_start[n+1]; q++) {
             bool own = q < block_start[n+1];
-            const V* o = slope + 3 * (own ? block_row[q] : column_count);
-                const V* b = own ? blocks + 12*q : carry + 9*n;
+            M o = slope + 3 * (own ? block_row[q] : column_count);
+                M b = own ? blocks + 12*q : carry + 9*n;
             int w = own ? 4 : 3;
             for (int r = 0; r < 3; r++) { z0 -= b[w*r] * o[r]; z1 -= b[w*r+1] * o[r];
                 z2 -= b[w*r+2] * o[r]; }
@@ -224,8 +223,8 @@ SOLVE = """
 
 _DEVIATION = """
 #define DEVIATE(q, rel) \\
-        int k_ = soft[q]; const V* x = (rel) + 9 * joint[k_]; \\
-        const V* y = (const V*)reference.data + 9*(q); \\
+        int k_ = soft[q]; M x = (rel) + 9 * joint[k_]; \\
+        M y = (M)reference.data + 9*(q); \\
         V tr_ = zero; for (int i = 0; i < 9; i++) tr_ += x[i] * y[i]; \\
         V a0 = zero, a1 = zero, a2 = zero; \\
         for (int i = 0; i < 3; i++) { a0 += x[6+i] * y[3+i] - x[3+i] * y[6+i]; \\
@@ -254,10 +253,10 @@ TERMS = (
             R t = free_ > 0 ? s_ * o / (g > R(1e-6) ? g : R(1e-6)) : s_;
             ((R*)&across)[n] = t; ((R*)&along)[n] = o > 0 ? s_ : t;
         }
-        const V* d = turns + 9 * parent[k_]; V w[3];
+        M d = turns + 9 * parent[k_]; V w[3];
         for (int r = 0; r < 3; r++) { w[r] = d[3*r]*a0 + d[3*r+1]*a1 + d[3*r+2]*a2;
             slope[3*k_+r] += own * over * w[r]; }
-        V* b = blocks + 12 * block_start[k_];
+        M b = blocks + 12 * block_start[k_];
         for (int r = 0; r < 3; r++) {
             b[5*r] += across;
             for (int c = 0; c < 3; c++) b[4*r+c] += (along - across) * w[r] * w[c];
@@ -267,7 +266,7 @@ TERMS = (
     const R* hinge = stiff + 2 * soft_count;
     if (!trial) for (int n = driven_count; n < hinge_end; n++) {
         const R* e = hinge + 3*n; if (e[0] == 0 && e[1] == 0 && e[2] == 0) continue;
-        const V* d = turns + 9 * parent[n]; V* b = blocks + 12 * block_start[n]; V w[3];
+        M d = turns + 9 * parent[n]; M b = blocks + 12 * block_start[n]; V w[3];
         for (int r = 0; r < 3; r++) w[r] = d[3*r]*e[0] + d[3*r+1]*e[1] + d[3*r+2]*e[2];
         V big = stiffness * (b[0] + b[5] + b[10]);
         for (int r = 0; r < 3; r++) { b[5*r] += big; for (int c = 0; c < 3;
@@ -280,7 +279,7 @@ MOVE = """
     const R* hinge = stiffs.data + 2 * soft_count;
     for (int n = driven_count; n < hinge_end; n++) {
         const R* e = hinge + 3*n; if (e[0] == 0 && e[1] == 0 && e[2] == 0) continue;
-        const V* d = turns + 9 * parent[n]; V* x = slope + 3*n; V w[3];
+        M d = turns + 9 * parent[n]; M x = slope + 3*n; V w[3];
         for (int r = 0; r < 3; r++) w[r] = d[3*r]*e[0] + d[3*r+1]*e[1] + d[3*r+2]*e[2];
         V along = w[0]*x[0] + w[1]*x[1] + w[2]*x[2]; for (int r = 0; r < 3; r++) x[r] = along * w[r];
     }
@@ -289,13 +288,13 @@ MOVE = """
         for (int i = 0; i < N; i++) {
             R len = wp::sqrt(((R*)&q)[i]); ((R*)&cut)[i] = R(0.5) * (len > longest ? longest / len : R(1));
         }
-        const V* d = turns + 9 * parent[n];
+        M d = turns + 9 * parent[n];
         V a = cut * (d[0]*x + d[3]*y + d[6]*z), b = cut * (d[1]*x + d[4]*y + d[7]*z);
         V c = cut * (d[2]*x + d[5]*y + d[8]*z);
         V f = R(2) / (one + a*a + b*b + c*c), fa = f*a, fb = f*b, fc = f*c;
         V m[9] = {one - fb*b - fc*c, fa*b - fc, fa*c + fb, fa*b + fc, one - fa*a - fc*c, fb*c - fa,
                   fa*c - fb, fb*c + fa, one - fa*a - fb*b};
-        const V* u = relative + 9 * joint[n]; V* o = trial_relative + 9 * joint[n]; V t[9], g[9];
+        M u = relative + 9 * joint[n]; M o = trial_relative + 9 * joint[n]; V t[9], g[9];
         for (int r = 0; r < 3; r++) for (int k_ = 0; k_ < 3; k_++)
             t[3*r+k_] = m[3*r] * u[k_] + m[3*r+1] * u[3+k_] + m[3*r+2] * u[6+k_];
         for (int r = 0; r < 3; r++) for (int k_ = 0; k_ < 3; k_++)

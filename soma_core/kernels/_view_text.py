@@ -7,7 +7,7 @@ __all__ = ["ACTIVATE", "DOUBT", "KEEP", "PULL", "TRANSFORM", "TURN"]
 
 TRANSFORM = """
     for (int j = 0; j < all_count; j++) {
-        const C* b = binds + 12*j; const V* d = turns + 9*j; V* o = transform + 12*j;
+        L b = binds + 12*j; M d = turns + 9*j; M o = transform + 12*j;
         for (int r = 0; r < 3; r++, o += 4) {
             for (int c = 0; c < 3; c++) o[c] = d[3*r] * b[c] + d[3*r+1] * b[4+c] + d[3*r+2] * b[8+c];
             o[3] = places[3*j+r] - (o[0] * b[3] + o[1] * b[7] + o[2] * b[11]);
@@ -46,9 +46,9 @@ ACTIVATE = (
     _TANH
     + """
     const int W = 3 * feature_columns;
-    V* to = feature;
+    M to = feature;
     for (int i = 0; i < feature_count; i++) {
-        const V* x = relative + 9 * feature_joint[i];
+        M x = relative + 9 * feature_joint[i];
         const R* l = feature_left + 9*i; const R* d = feature_right + W*i; const R* o = feature_still + W*i;
         for (int r = 0; r < 3; r++, l += 3) {
             V y0 = l[0] * x[0] + l[1] * x[3] + l[2] * x[6], y1 = l[0] * x[1] + l[1] * x[4] + l[2] * x[7];
@@ -73,7 +73,7 @@ ACTIVATE = (
 
 PULL = """
     for (int t = 0; t < weighted_count; t++) {
-        const C* b = binds + 12 * weighted[t]; const V* f = push + 12 * weighted[t]; V* x = residual + 12*t;
+        L b = binds + 12 * weighted[t]; M f = push + 12 * weighted[t]; M x = residual + 12*t;
         for (int r = 0; r < 3; r++, f += 4, x += 4) {
             V a0 = f[0] - f[3] * b[3], a1 = f[1] - f[3] * b[7], a2 = f[2] - f[3] * b[11];
             for (int c = 0; c < 3; c++) x[c] = a0 * b[4*c] + a1 * b[4*c+1] + a2 * b[4*c+2];
@@ -93,8 +93,8 @@ TURN = """
     }
     for (int i = 0; i < feature_count; i++) {
         int n = feature_column[i]; if (n < 0) continue;
-        const R* l = feature_left + 9*i; const R* d = feature_right + W*i; const V* g = feature + W*i;
-        const V* x = relative + 9 * feature_joint[i]; V m[9], y[9], p[9];
+        const R* l = feature_left + 9*i; const R* d = feature_right + W*i; M g = feature + W*i;
+        M x = relative + 9 * feature_joint[i]; V m[9], y[9], p[9];
         for (int r = 0; r < 3; r++) for (int c = 0; c < 3; c++) {
             V sum = zero;
             for (int q = 0; q < feature_columns; q++) sum += g[r*feature_columns+q] * d[c*feature_columns+q];
@@ -105,7 +105,7 @@ TURN = """
         for (int r = 0; r < 3; r++) for (int c = 0; c < 3; c++)
             p[3*r+c] = x[3*r] * y[3*c] + x[3*r+1] * y[3*c+1] + x[3*r+2] * y[3*c+2];
         V s0 = p[5] - p[7], s1 = p[6] - p[2], s2 = p[1] - p[3];
-        const V* a = turns + 9 * parent[n];
+        M a = turns + 9 * parent[n];
         for (int r = 0; r < 3; r++) slope[3*n+r] += a[3*r] * s0 + a[3*r+1] * s1 + a[3*r+2] * s2;
     }
 """
@@ -118,11 +118,11 @@ KEEP = """
 """A step as what a solver gives, which it is the negative of, and rotations of joints that do not move."""
 
 DOUBT = """
-    const int* column_of = columns.data; const R* axis = spins.data; const V* square = (const V*)squares.data;
+    const int* column_of = columns.data; const R* axis = spins.data; M square = (M)squares.data;
     V total = zero;
     for (int i = 3 * driven_count; i < 3 * column_count + 3; i++) slope[i] = zero;
     for (int q = 0; q < count; q++, axis += 3) {
-        int n = column_of[q]; const V* x = relative + 9 * joint[n]; const V* d = turns + 9 * parent[n];
+        int n = column_of[q]; M x = relative + 9 * joint[n]; M d = turns + 9 * parent[n];
         V real = one + x[0] + x[4] + x[8]; real = real > R(1e-6) ? real : zero + R(1e-6);
         V v[3] = {x[7] - x[5], x[2] - x[6], x[3] - x[1]}, g[3];
         V along = v[0] * axis[0] + v[1] * axis[1] + v[2] * axis[2], ratio = along / real;

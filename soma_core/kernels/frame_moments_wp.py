@@ -6,8 +6,17 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from soma_core.kernels._lanes import as_lanes, from_lanes, in_threads, lane_count, lane_types, to_lanes
-from soma_core.kernels._runtime import as_warp, launching, scalar_name
+from soma_core.kernels._lanes import (
+    as_lanes,
+    from_lanes,
+    in_threads,
+    lane_count,
+    lane_types,
+    launch,
+    to_lanes,
+    worker_count,
+)
+from soma_core.kernels._runtime import as_warp, scalar_name
 
 __all__ = ["frame_moments"]
 
@@ -184,16 +193,11 @@ def frame_moments(
     tables = rest, weights, vertices
 
     def run(part: slice) -> None:
-        workers = part.stop - part.start if vertices.is_cuda else 1
-        points = new(workers, 7 * vertices.shape[1], lanes)
+        workers, size = worker_count(part.stop - part.start, lanes), 7 * vertices.shape[1]
+        points = new(workers, size, lanes) if lanes > 1 else new(size, workers, 1).transpose(0, 1)
         shown = [as_lanes(one[: part.stop], types) for one in (centre, *out)]
-        with launching(vertices) as device:
-            wp.launch(
-                kernel, dim=workers,
-                inputs=[part.start, *map(as_warp, lists), *map(as_warp, tables), shown[0],
-                        as_lanes(points, types), *shown[1:]],
-                device=device,
-            )  # fmt: skip
+        inputs = [part.start, *map(as_warp, lists), *map(as_warp, tables), shown[0]]
+        launch(kernel, workers, [*inputs, as_lanes(points, types), *shown[1:]], vertices)
 
     in_threads(run, len(centre), vertices)
     joint_count = centres.shape[1]

@@ -13,10 +13,18 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from soma_core.kernels._lanes import in_threads, lane_count
+from soma_core.kernels._lanes import (
+    as_rows,
+    in_threads,
+    lane_count,
+    launch,
+    row_of,
+    worker_count,
+    working_rows,
+)
 from soma_core.kernels._native import transposing
 from soma_core.kernels._residual_phases import TILE, phases, tile_slots
-from soma_core.kernels._runtime import as_warp, launching, scalar_name
+from soma_core.kernels._runtime import as_warp, scalar_name
 
 __all__ = ["residual_sums", "residual_tables"]
 
@@ -48,8 +56,8 @@ class _Task:
 @functools.cache
 def _kernel(scalar: str, lanes: int):
     width, size, at_length = lanes, TILE, tile_slots().length
-    real, rows = wp.array(dtype=getattr(wp, scalar)), wp.array2d(dtype=getattr(wp, scalar))
-    load, store = transposing(scalar, lanes)
+    real, rows = wp.array(dtype=getattr(wp, scalar)), wp.array3d(dtype=getattr(wp, scalar))
+    (load, store), row = transposing(scalar, lanes), row_of(scalar)
     step = phases(scalar, lanes)
     enter, gather, leave = _enter(real, load, step), _gather(real, load, step), _leave(real, store)
     clear, moved, draw, push = step.clear, step.moved, step.pulled, step.forces
@@ -67,38 +75,33 @@ def _kernel(scalar: str, lanes: int):
         energy: real, forces: real, pull: real, distances: real,
     ):  # fmt: skip
         w = wp.tid() * task.together
-        for block in range(task.begin + w, task.end, tiles.shape[0]):
+        for block in range(task.begin + w, task.end, tiles.shape[0] * tiles.shape[1]):
             groups = wp.min(task.together, task.end - block)
             for s in range(w, w + groups):
                 f = (block + s - w) * width
-                enter(task, f, transforms, active, scale, origin, bound, turns[s], sources[s], tiles[s])
-                clear(pushes[s], 0, 12 * task.joints * task.pulls)
-                clear(pulls[s], 0, task.activations * task.pulls)
+                turn, source, tile = row(turns, s), row(sources, s), row(tiles, s)
+                enter(task, f, transforms, active, scale, origin, bound, turn, source, tile)
+                clear(row(pushes, s), 0, 12 * task.joints * task.pulls)
+                clear(row(pulls, s), 0, task.activations * task.pulls)
             for t in range((task.vertices + size - 1) // size):
                 a = t * size
                 b = wp.min(a + size, task.vertices)
                 for s in range(w, w + groups):
                     f = (block + s - w) * width
-                    tile = tiles[s]
+                    tile = row(tiles, s)
                     gather(task, f, a, b, rest, weights, targets, tile)
-                    moved(move_start, move_id, move_value, sources[s], a, b, tile)
-                    skinned(task, skin_start, skin_joint, skin_value, turns[s], weights, a, b, tile)
+                    moved(move_start, move_id, move_value, row(sources, s), a, b, tile)
+                    turn = row(turns, s)
+                    skinned(task, skin_start, skin_joint, skin_value, turn, weights, a, b, tile)
                     shown = (b - a) * task.measured
                     store(tile, at_length, shown, distances, wp.int64(task.vertices), a, f, task.frames - 1)
-                    draw(move_start, move_id, move_value, a, a + (b - a) * task.pulls, tile, pulls[s])
-                    push(
-                        joint_run,
-                        joint_id,
-                        joint_start,
-                        joint_row,
-                        joint_value,
-                        t,
-                        t + task.pulls,
-                        tile,
-                        pushes[s],
-                    )
+                    back = row(pulls, s)
+                    draw(move_start, move_id, move_value, a, a + (b - a) * task.pulls, tile, back)
+                    end, force = t + task.pulls, row(pushes, s)
+                    push(joint_run, joint_id, joint_start, joint_row, joint_value, t, end, tile, force)
             for s in range(w, w + groups):
-                leave(task, (block + s - w) * width, tiles[s], pushes[s], pulls[s], energy, forces, pull)
+                tile, force, back = row(tiles, s), row(pushes, s), row(pulls, s)
+                leave(task, (block + s - w) * width, tile, force, back, energy, forces, pull)
 
     return run
 
@@ -208,9 +211,9 @@ def residual_sums(
     sizes = 12 * joints, activations, 12 * joints, activations, tile_slots().size
 
     def run(part: slice) -> None:
-        workers = part.stop - part.start if targets.is_cuda else 1
-        together = 1 if targets.is_cuda else min(_TOGETHER, part.stop - part.start)
-        work = [new(workers * together, size * lanes) for size in sizes]
+        workers = worker_count(part.stop - part.start, lanes)
+        together = 1 if lanes == 1 else min(_TOGETHER, part.stop - part.start)
+        work = [working_rows(targets, workers * together, size, lanes) for size in sizes]
         task = _Task()
         task.begin, task.end, task.together = part.start, part.stop, together
         task.frames, task.vertices = count, vertices
@@ -218,9 +221,8 @@ def residual_sums(
         task.own_rest, task.own_weights = int(len(rest) > 1), int(len(weights) > 1)
         task.clipped, task.pulls, task.measured = int(bound is not None), int(gradient), int(distances)
         flat = [as_warp(one.view(-1)) for one in (*given, *out)]
-        with launching(targets) as device:
-            inputs = [task, *map(as_warp, tables.values()), *flat[:8], *map(as_warp, work), *flat[8:]]
-            wp.launch(kernel, dim=workers, inputs=inputs, device=device)
+        inputs = [task, *map(as_warp, tables.values()), *flat[:8], *map(as_rows, work), *flat[8:]]
+        launch(kernel, workers, inputs, targets)
 
     in_threads(run, groups, targets)
     return out

@@ -8,9 +8,17 @@ import warp as wp
 from torch import Tensor
 
 from soma_core.geometry.kabsch import PRIOR_STRENGTH
-from soma_core.kernels._lanes import in_threads, lane_count
+from soma_core.kernels._lanes import (
+    as_rows,
+    in_threads,
+    lane_count,
+    launch,
+    row_of,
+    worker_count,
+    working_rows,
+)
 from soma_core.kernels._native import native, transposing
-from soma_core.kernels._runtime import as_warp, launching, scalar_name
+from soma_core.kernels._runtime import as_warp, scalar_name
 
 __all__ = ["nearest_rotation"]
 
@@ -24,16 +32,16 @@ _FLOORS = {"float32": (1e-24, 1e-30, 1e-30), "float64": (math.ulp(0.0) ** 0.5, 1
 @functools.cache
 def _kernel(scalar: str, lanes: int):
     width, number, steps = lanes, getattr(wp, scalar), _NEWTON_STEPS
-    real, rows = wp.array(dtype=number), wp.array2d(dtype=number)
-    load, store = transposing(scalar, lanes)
+    real, rows = wp.array(dtype=number), wp.array3d(dtype=number)
+    (load, store), row = transposing(scalar, lanes), row_of(scalar)
     shift, polar, checked = (_native(one, real, scalar, lanes) for one in ("shift", "polar", "checked"))
     module = wp.get_module(f"soma_nearest_rotation_{scalar}_{lanes}")
 
     @wp.kernel(module=module, enable_backward=False)
     def nearest(first: int, stop: int, count: int, given: real, work: rows, out: real):
         w = wp.tid()
-        matrix = work[w]
-        for g in range(first + w, stop, work.shape[0]):
+        matrix = row(work, w)
+        for g in range(first + w, stop, work.shape[0] * work.shape[1]):
             load(given, wp.int64(9), 0, 9, g * width, count - 1, matrix, 0)
             shift(matrix)
             for _ in range(steps):
@@ -57,17 +65,17 @@ def _native(name: str, real, scalar: str, lanes: int) -> wp.Function:
 
 
 _COFACTOR = """
-    V* x = (V*)matrix.data;
-    auto cofactor = [](const V* m, V* c) {
+    M x = (M)matrix.data;
+    auto cofactor = [](const auto& m, V* c) {
         for (int i = 0; i < 3; i++) {
-            const V *a = m + 3 * ((i + 1) % 3), *b = m + 3 * ((i + 2) % 3);
+            const auto a = m + 3 * ((i + 1) % 3), b = m + 3 * ((i + 2) % 3);
             for (int k = 0; k < 3; k++) {
                 const int p = (k + 1) % 3, q = (k + 2) % 3;
                 c[3 * i + k] = a[p] * b[q] - a[q] * b[p];
             }
         }
     };
-    auto squares = [](const V* m) {
+    auto squares = [](const auto& m) {
         V sum = V{};
         for (int i = 0; i < 9; i++) sum += m[i] * m[i];
         return sum;
@@ -134,11 +142,10 @@ def nearest_rotation(covariance: Tensor) -> Tensor:
     kernel, groups, out = _kernel(scalar, lanes), -(-count // lanes), torch.empty_like(given)
 
     def run(part: slice) -> None:
-        work = given.new_empty(part.stop - part.start if given.is_cuda else 1, 9 * lanes)
-        flat = [as_warp(one) for one in (given.view(-1), work, out.view(-1))]
-        with launching(given) as device:
-            inputs = [part.start, part.stop, count, *flat]
-            wp.launch(kernel, dim=len(work), inputs=inputs, device=device)
+        workers = worker_count(part.stop - part.start, lanes)
+        work = working_rows(given, workers, 9, lanes)
+        flat = as_warp(given.view(-1)), as_rows(work), as_warp(out.view(-1))
+        launch(kernel, workers, [part.start, part.stop, count, *flat], given)
 
     in_threads(run, groups, given)
     return out

@@ -14,9 +14,18 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from soma_core.kernels._lanes import in_threads, lane_count, to_lanes
+from soma_core.kernels._lanes import (
+    as_rows,
+    frame_rows,
+    in_threads,
+    lane_count,
+    launch,
+    row_of,
+    worker_count,
+    working_rows,
+)
 from soma_core.kernels._native import transposing
-from soma_core.kernels._runtime import as_warp, launching, scalar_name
+from soma_core.kernels._runtime import as_warp, scalar_name
 from soma_core.kernels._solver_functions import Task, solver_functions
 from soma_core.kernels._solver_layout import COUNTS, EXTRA, LISTS, NUMBERS, slot_sizes
 from soma_core.kernels.pose_steps_wp import factor_kernel, solution_kernels, step_kernels, tree_kernels
@@ -29,9 +38,9 @@ _ids = wp.array(dtype=wp.int32)
 @functools.cache
 def _kernel(scalar: str, lanes: int, *, shared: bool):
     number = getattr(wp, scalar)
-    real, rows = wp.array(dtype=number), wp.array2d(dtype=number)
+    real, rows = wp.array(dtype=number), wp.array3d(dtype=number)
     body, width = solver_functions(scalar, lanes, shared=shared), lanes
-    load, store = transposing(scalar, lanes)
+    (load, store), row = transposing(scalar, lanes), row_of(scalar)
     walk, change, copy, assemble, twists = body.walk, body.change, body.copy, body.assemble, body.twists
     forces, factor, solve, terms = body.forces, body.factor, body.solve, body.terms
     move, accept, still = body.move, body.accept, body.still
@@ -45,10 +54,10 @@ def _kernel(scalar: str, lanes: int, *, shared: bool):
         relative_out: real, hips_out: real, accepted: real, last_change: real,
     ):  # fmt: skip
         w, count, hinge_end = wp.tid(), task.soft_count, task.hinge_end
-        for g in range(task.begin + w, task.end, memory.shape[0]):
+        for g in range(task.begin + w, task.end, memory.shape[0] * memory.shape[1]):
             f, last = g * width, task.frames - 1
-            s, m, k = memory[w], kept[w], constants[wp.min(g, constants.shape[0] - 1)]
-            own = reference[wp.min(g, reference.shape[0] - 1)]
+            s, m, k = row(memory, w), row(kept, w), row(constants, g)
+            own = row(reference, g)
             still(plan, numbers, k, s, m, damping[0])
             turn, moments = wp.int64(at[5]), wp.int64(at[6])
             load(relative, turn, 0, at[5], f, last, s, at[0])
@@ -143,13 +152,14 @@ class PoseSolver:
         self.at = torch.tensor(at, dtype=torch.int32, device=device)
         self.memory, self.kept = sum(slots.values()), sum(kept.values())
         self.driven, self.columns = d, c
+        self._sent: dict[tuple[float, ...], Tensor] = {}
 
     def constants(self, *parts: Tensor) -> tuple[Tensor, bool]:
-        """Numbers of identities in one: (1, size) of one for all frames, else (groups, size x lanes)."""
+        """Numbers of identities in one: (1, 1, size) of one for all frames, else those of each."""
         shared = all(len(part) == 1 for part in parts)
         count = max(len(part) for part in parts)
         flat = torch.cat([part.flatten(1).expand(count, -1) for part in parts], 1).contiguous()
-        return (flat, True) if shared else (to_lanes(flat, lane_count(flat)).flatten(1), False)
+        return (flat[:, None], True) if shared else (frame_rows(flat, lane_count(flat)), False)
 
     def fit(
         self, constants: tuple[Tensor, bool], target: Tensor, relative: Tensor, hips: Tensor,
@@ -176,7 +186,7 @@ class PoseSolver:
         outputs += [mass.new_empty(len(hips)) for _ in range(2)]
         like = relative
         kernel = _kernel(scalar_name(like.dtype), lane_count(like), shared=constants[1])
-        numbers = like.new_tensor(damping)
+        numbers = self._on_device(damping, like)
         given, _kept = self._soft(soft)
         frames = [one.contiguous() for one in (target, relative, hips, threshold, mass)]
         self._launch(
@@ -186,6 +196,12 @@ class PoseSolver:
                   "hinge_end": self.columns if soft.hinged else self.driven},
         )  # fmt: skip
         return tuple(outputs)
+
+    def _on_device(self, numbers: tuple[float, ...], like: Tensor) -> Tensor:
+        """Few numbers, sent once."""
+        if numbers not in self._sent:
+            self._sent[numbers] = like.new_tensor(numbers)
+        return self._sent[numbers]
 
     def walked(self, constants: tuple[Tensor, bool], relative: Tensor, hips: Tensor) -> tuple[Tensor, Tensor]:
         """World turns (F, J', 3, 3) and places (F, J', 3) of all joints."""
@@ -264,14 +280,11 @@ class PoseSolver:
         share = relative.new_empty(len(relative))
         slope = relative.new_empty(len(relative), self.columns - self.driven + 1, 3)
         lanes = lane_count(relative)
-        given = (
-            columns, axes.contiguous(), to_lanes(squares, lanes).flatten(1), relative.contiguous(),
-            turns.contiguous(), share, slope,
-        )  # fmt: skip
-        self._launch(
-            step_kernels(scalar_name(relative.dtype), lanes, shared=True).doubted, relative.new_zeros(1, 1),
-            relative, tuple(map(as_warp, given)), task={"soft_count": len(columns)},
-        )  # fmt: skip
+        given = columns, axes.contiguous(), relative.contiguous(), turns.contiguous(), share, slope
+        rows, shown = frame_rows(squares, lanes), tuple(map(as_warp, given))
+        kernel = step_kernels(scalar_name(relative.dtype), lanes, shared=True).doubted
+        shown = *shown[:2], as_rows(rows), *shown[2:]
+        self._launch(kernel, relative.new_zeros(1, 1, 1), relative, shown, task={"soft_count": len(columns)})
         return share, _ascending(slope)
 
     @staticmethod
@@ -285,7 +298,7 @@ class PoseSolver:
         """The damped Gauss-Newton matrix of F poses, factorised."""
         lanes = lane_count(relative)
         groups = -(-len(hips) // lanes)
-        kept = relative.new_empty(groups, self.kept * lanes)
+        kept = working_rows(relative, groups, self.kept, lanes)
         kernel = factor_kernel(scalar_name(relative.dtype), lanes, shared=constants[1])
         none = relative.new_zeros(1)
         frames = [one.contiguous() for one in (relative, hips, damping, mass)]
@@ -302,7 +315,7 @@ class PoseSolver:
         given = _ascending(slope).contiguous()
         out = torch.empty_like(given)
         kernel = solution_kernels(scalar_name(slope.dtype), lane_count(slope)).solved
-        none = slope.new_zeros(1, 1)
+        none = slope.new_zeros(1, 1, 1)
         self._launch(kernel, none, slope, (as_warp(given), as_warp(out)), kept=factor.kept)
         return _ascending(out)
 
@@ -310,16 +323,14 @@ class PoseSolver:
         """Traces (F, n) of the variables' own blocks of the matrix's inverse, ascending."""
         out = factor.kept.new_empty(factor.count, self.columns - self.driven)
         kernel = solution_kernels(scalar_name(out.dtype), lane_count(out)).varied
-        self._launch(kernel, out.new_zeros(1, 1), out, (as_warp(out),), kept=factor.kept)
+        self._launch(kernel, out.new_zeros(1, 1, 1), out, (as_warp(out),), kept=factor.kept)
         return out.flip(1)
 
     def _soft(self, soft: Soft):
         columns = soft.columns if len(soft.columns) else soft.columns.new_zeros(1)
-        lanes = lane_count(soft.numbers)
-        reference = soft.reference
-        flat = to_lanes(reference, lanes) if len(soft.columns) else soft.numbers.new_zeros(1, 1, lanes)
-        kept = columns, soft.numbers, flat.flatten(1)
-        return tuple(map(as_warp, kept)), kept
+        reference = soft.reference if len(soft.columns) else soft.numbers.new_zeros(1, 1)
+        kept = columns, soft.numbers, frame_rows(reference.flatten(1), lane_count(reference))
+        return (as_warp(columns), as_warp(soft.numbers), as_rows(kept[2])), kept
 
     def _launch(self, kernel, constants: Tensor, like: Tensor, given: tuple, *, kept=None, task=None) -> None:
         lanes = lane_count(like)
@@ -327,21 +338,16 @@ class PoseSolver:
         groups = -(-frames // lanes)
 
         def run(part: slice) -> None:
-            workers = part.stop - part.start if like.is_cuda else 1
-            memory = like.new_empty(workers, self.memory * lanes)
-            own = like.new_empty(workers, self.kept * lanes) if kept is None else kept
+            workers = worker_count(part.stop - part.start, lanes)
+            memory = working_rows(like, workers, self.memory, lanes)
+            own = working_rows(like, workers, self.kept, lanes) if kept is None else kept
             numbers = Task()
             numbers.begin, numbers.end, numbers.frames = part.start, part.stop, frames
             for name, value in (task or {}).items():
                 setattr(numbers, name, value)
-            with launching(like) as device:
-                wp.launch(
-                    kernel, dim=workers,
-                    inputs=[numbers, as_warp(self.plan), as_warp(self.numbers), as_warp(constants),
-                    as_warp(memory),
-                            as_warp(own), as_warp(self.at), *given],
-                    device=device,
-                )  # fmt: skip
+            tables = as_warp(self.plan), as_warp(self.numbers), as_rows(constants)
+            inputs = [numbers, *tables, as_rows(memory), as_rows(own), as_warp(self.at), *given]
+            launch(kernel, workers, inputs, like)
 
         in_threads(run, groups, like)
 

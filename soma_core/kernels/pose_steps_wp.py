@@ -5,6 +5,7 @@ from types import SimpleNamespace
 
 import warp as wp
 
+from soma_core.kernels._lanes import row_of
 from soma_core.kernels._native import transposing
 from soma_core.kernels._solver_functions import Task, solver_functions
 
@@ -44,10 +45,11 @@ def _enter(scalar: str, lanes: int, *, shared: bool):
 def tree_kernels(scalar: str, lanes: int, *, shared: bool) -> SimpleNamespace:
     """The tree of a pose, what it gives the model's residual, and what that says of its joints."""
     number = getattr(wp, scalar)
-    real, rows = wp.array(dtype=number), wp.array2d(dtype=number)
+    real, rows = wp.array(dtype=number), wp.array3d(dtype=number)
     body, width = solver_functions(scalar, lanes, shared=shared), lanes
     forces, transform, activate, pull, turn = body.forces, body.transform, body.activate, body.pull, body.turn
     (load, store), enter = transposing(scalar, lanes), _enter(scalar, lanes, shared=shared)
+    row = row_of(scalar)
     module = wp.get_module(f"soma_pose_tree_{scalar}_{lanes}_{'one' if shared else 'each'}")
 
     @wp.kernel(module=module, enable_backward=False)
@@ -57,9 +59,9 @@ def tree_kernels(scalar: str, lanes: int, *, shared: bool) -> SimpleNamespace:
         slope: real,
     ):  # fmt: skip
         w, size, count = wp.tid(), 4 * at[14], at[20] * task.outcome
-        for g in range(task.begin + w, task.end, memory.shape[0]):
+        for g in range(task.begin + w, task.end, memory.shape[0] * memory.shape[1]):
             f, last = g * width, task.frames - 1
-            s, m, k = memory[w], kept[w], constants[wp.min(g, constants.shape[0] - 1)]
+            s, m, k = row(memory, w), row(kept, w), row(constants, g)
             enter(plan, numbers, k, s, m, at, f, last, relative, hips)
             store(s, at[11], at[12], turns, wp.int64(at[12]), 0, f, last)
             store(s, at[13], at[14], places, wp.int64(at[14]), 0, f, last)
@@ -77,9 +79,9 @@ def tree_kernels(scalar: str, lanes: int, *, shared: bool) -> SimpleNamespace:
         relative: real, hips: real, push: real, pulls: real, activity: real, slope: real, residual: real,
     ):  # fmt: skip
         w, size, count = wp.tid(), 4 * at[14], at[20]
-        for g in range(task.begin + w, task.end, memory.shape[0]):
+        for g in range(task.begin + w, task.end, memory.shape[0] * memory.shape[1]):
             f, last = g * width, task.frames - 1
-            s, m, k = memory[w], kept[w], constants[wp.min(g, constants.shape[0] - 1)]
+            s, m, k = row(memory, w), row(kept, w), row(constants, g)
             enter(plan, numbers, k, s, m, at, f, last, relative, hips)
             load(push, wp.int64(size), 0, size, f, last, s, at[25])
             load(pulls, wp.int64(count), 0, count, f, last, s, at[26])
@@ -97,10 +99,11 @@ def tree_kernels(scalar: str, lanes: int, *, shared: bool) -> SimpleNamespace:
 def step_kernels(scalar: str, lanes: int, *, shared: bool) -> SimpleNamespace:
     """Poses after a step, and the doubt of twists."""
     number = getattr(wp, scalar)
-    real, rows = wp.array(dtype=number), wp.array2d(dtype=number)
+    real, rows = wp.array(dtype=number), wp.array3d(dtype=number)
     body, width = solver_functions(scalar, lanes, shared=shared), lanes
     move, keep, doubt = body.move, body.keep, body.doubt
     (load, store), enter = transposing(scalar, lanes), _enter(scalar, lanes, shared=shared)
+    row = row_of(scalar)
     module = wp.get_module(f"soma_pose_step_{scalar}_{lanes}_{'one' if shared else 'each'}")
 
     @wp.kernel(module=module, enable_backward=False)
@@ -110,9 +113,9 @@ def step_kernels(scalar: str, lanes: int, *, shared: bool) -> SimpleNamespace:
         relative: real, hips: real, step: real, relative_out: real, hips_out: real,
     ):  # fmt: skip
         w = wp.tid()
-        for g in range(task.begin + w, task.end, memory.shape[0]):
+        for g in range(task.begin + w, task.end, memory.shape[0] * memory.shape[1]):
             f, last = g * width, task.frames - 1
-            s, m, k = memory[w], kept[w], constants[wp.min(g, constants.shape[0] - 1)]
+            s, m, k = row(memory, w), row(kept, w), row(constants, g)
             enter(plan, numbers, k, s, m, at, f, last, relative, hips)
             load(step, wp.int64(at[17]), 0, at[17], f, last, s, at[16])
             keep(plan, numbers, k, s, m)
@@ -127,12 +130,12 @@ def step_kernels(scalar: str, lanes: int, *, shared: bool) -> SimpleNamespace:
         relative: real, turns: real, share: real, slope: real,
     ):  # fmt: skip
         w = wp.tid()
-        for g in range(task.begin + w, task.end, memory.shape[0]):
+        for g in range(task.begin + w, task.end, memory.shape[0] * memory.shape[1]):
             f, last = g * width, task.frames - 1
-            s, m, k = memory[w], kept[w], constants[0]
+            s, m, k = row(memory, w), row(kept, w), row(constants, 0)
             load(relative, wp.int64(at[5]), 0, at[5], f, last, s, at[7])
             load(turns, wp.int64(at[12]), 0, at[5], f, last, s, at[11])
-            own = squares[wp.min(g, squares.shape[0] - 1)]
+            own = row(squares, g)
             doubt(plan, numbers, k, s, m, columns, spins, own, task.soft_count)
             store(s, at[27], 1, share, wp.int64(1), 0, f, last)
             store(s, at[16], at[17], slope, wp.int64(at[17]), 0, f, last)
@@ -144,11 +147,12 @@ def step_kernels(scalar: str, lanes: int, *, shared: bool) -> SimpleNamespace:
 def factor_kernel(scalar: str, lanes: int, *, shared: bool):
     """The factorised matrix of the whole model."""
     number = getattr(wp, scalar)
-    real, rows = wp.array(dtype=number), wp.array2d(dtype=number)
+    real, rows = wp.array(dtype=number), wp.array3d(dtype=number)
     body, width = solver_functions(scalar, lanes, shared=shared), lanes
     assemble, twists, modes = body.assemble, body.twists, body.modes
     factor, terms = body.factor, body.terms
     (load, _), enter = transposing(scalar, lanes), _enter(scalar, lanes, shared=shared)
+    row = row_of(scalar)
     module = wp.get_module(f"soma_pose_factor_{scalar}_{lanes}_{'one' if shared else 'each'}")
 
     @wp.kernel(module=module, enable_backward=False)
@@ -158,10 +162,10 @@ def factor_kernel(scalar: str, lanes: int, *, shared: bool):
         relative: real, hips: real, damping: real, mass: real, activity: real, scale: real,
     ):  # fmt: skip
         w = wp.tid()
-        for g in range(task.begin + w, task.end, memory.shape[0]):
+        for g in range(task.begin + w, task.end, memory.shape[0] * memory.shape[1]):
             f, last = g * width, task.frames - 1
-            s, m, k = memory[w], kept[g], constants[wp.min(g, constants.shape[0] - 1)]
-            own = reference[wp.min(g, reference.shape[0] - 1)]
+            s, m, k = row(memory, w), row(kept, g), row(constants, g)
+            own = row(reference, g)
             enter(plan, numbers, k, s, m, at, f, last, relative, hips)
             load(damping, wp.int64(1), 0, 1, f, last, s, at[18])
             load(mass, wp.int64(1), 0, 1, f, last, s, at[4])
@@ -181,9 +185,10 @@ def factor_kernel(scalar: str, lanes: int, *, shared: bool):
 def solution_kernels(scalar: str, lanes: int) -> SimpleNamespace:
     """What a factorised matrix is asked for: solutions, and the variables' variances."""
     number = getattr(wp, scalar)
-    real, rows = wp.array(dtype=number), wp.array2d(dtype=number)
+    real, rows = wp.array(dtype=number), wp.array3d(dtype=number)
     body, width = solver_functions(scalar, lanes, shared=True), lanes
     (load, store), solve, selected = transposing(scalar, lanes), body.solve, body.selected
+    row = row_of(scalar)
     module = wp.get_module(f"soma_pose_solution_{scalar}_{lanes}")
 
     @wp.kernel(module=module, enable_backward=False)
@@ -192,9 +197,9 @@ def solution_kernels(scalar: str, lanes: int) -> SimpleNamespace:
         slope: real, out: real,
     ):  # fmt: skip
         w = wp.tid()
-        for g in range(task.begin + w, task.end, memory.shape[0]):
+        for g in range(task.begin + w, task.end, memory.shape[0] * memory.shape[1]):
             f, last = g * width, task.frames - 1
-            s, m, k = memory[w], kept[g], constants[0]
+            s, m, k = row(memory, w), row(kept, g), row(constants, 0)
             load(slope, wp.int64(at[17]), 0, at[17], f, last, s, at[16])
             solve(plan, numbers, k, s, m)
             store(s, at[16], at[17], out, wp.int64(at[17]), 0, f, last)
@@ -204,8 +209,8 @@ def solution_kernels(scalar: str, lanes: int) -> SimpleNamespace:
         task: Task, plan: _ids, numbers: real, constants: rows, memory: rows, kept: rows, at: _ids, out: real
     ):
         w, count = wp.tid(), at[17] // 3 - 1
-        for g in range(task.begin + w, task.end, memory.shape[0]):
-            s, m, k = memory[w], kept[g], constants[0]
+        for g in range(task.begin + w, task.end, memory.shape[0] * memory.shape[1]):
+            s, m, k = row(memory, w), row(kept, g), row(constants, 0)
             selected(plan, numbers, k, s, m)
             store(s, at[16], count, out, wp.int64(count), 0, g * width, task.frames - 1)
 

@@ -7,9 +7,17 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from soma_core.kernels._lanes import in_threads, lane_count
+from soma_core.kernels._lanes import (
+    as_rows,
+    in_threads,
+    lane_count,
+    launch,
+    row_of,
+    worker_count,
+    working_rows,
+)
 from soma_core.kernels._native import native, transposing
-from soma_core.kernels._runtime import as_warp, launching, scalar_name
+from soma_core.kernels._runtime import as_warp, scalar_name
 
 __all__ = ["target_moments", "tile_runs"]
 
@@ -22,8 +30,8 @@ _ids = wp.array(dtype=wp.int64)
 @functools.cache
 def _kernel(scalar: str, lanes: int):
     width, size = lanes, _TILE
-    real, rows = wp.array(dtype=getattr(wp, scalar)), wp.array2d(dtype=getattr(wp, scalar))
-    load, store = transposing(scalar, lanes)
+    real, rows = wp.array(dtype=getattr(wp, scalar)), wp.array3d(dtype=getattr(wp, scalar))
+    (load, store), row = transposing(scalar, lanes), row_of(scalar)
     begin, add, end = _steps(real, scalar, lanes)
     module = wp.get_module(f"soma_target_moments_{scalar}_{lanes}")
 
@@ -35,11 +43,11 @@ def _kernel(scalar: str, lanes: int):
         origin: real, out: real,
     ):  # fmt: skip
         w = wp.tid()
-        tile, centre, total = tiles[w], centres[w], sums[w]
+        tile, centre, total = row(tiles, w), row(centres, w), row(sums, w)
         joints = start.shape[0] - 1
         stride = wp.int64(3 * count)
         last = frames - 1
-        for g in range(first + w, stop, tiles.shape[0]):
+        for g in range(first + w, stop, tiles.shape[0] * tiles.shape[1]):
             f = g * width
             for t in range(joints):
                 load(vertices, stride, 3 * wp.int32(vertex[start[t]]), 3, f, last, centre, 3 * t)
@@ -71,34 +79,33 @@ def _steps(real, scalar: str, lanes: int):
 
 
 _BEGIN = """
-    V* to = (V*)sums.data;
+    M to = (M)sums.data;
     for (int i = 0; i < count; i++) to[i] = V{};
 """
 
 # Sums of steps from a vertex nearby: float32 then loses nothing in long sums.
 _ADD = """
-    const V *points = (const V*)tile.data - 3 * first;
+    M points = (M)tile.data - 3 * first;
     for (int p = tile_run.data[t]; p < tile_run.data[t + 1]; p++) {
         const int joint = run_joint.data[p];
-        const V *centre = (const V*)centres.data + 3 * joint;
+        M centre = (M)centres.data + 3 * joint;
         V f[12];
         for (int k = 0; k < 12; k++) f[k] = V{};
         for (long long e = run_start.data[p]; e < run_stop.data[p]; e++) {
-            const V* x = points + 3 * vertex.data[e];
+            M x = points + 3 * vertex.data[e];
             const R* b = point.data + 4 * e;
             for (int i = 0; i < 3; i++) {
                 const V step = x[i] - centre[i];
                 for (int k = 0; k < 4; k++) f[4 * i + k] += b[k] * step;
             }
         }
-        V* to = (V*)sums.data + 12 * joint;
+        M to = (M)sums.data + 12 * joint;
         for (int k = 0; k < 12; k++) to[k] += f[k];
     }
 """
 
 _END = """
-    V *to = (V*)sums.data;
-    const V *centre = (const V*)centres.data, *origin = centre;
+    M to = (M)sums.data, centre = (M)centres.data, origin = centre;
     for (int t = 0; t < joints; t++, centre += 3)
         for (int i = 0; i < 3; i++)
             for (int k = 0; k < 4; k++) *to++ += mean.data[4 * t + k] * (centre[i] - origin[i]);
@@ -152,17 +159,13 @@ def target_moments(
     point = torch.cat((local * weight[:, None], weight[:, None]), 1)
 
     def run(part: slice) -> None:
-        workers = part.stop - part.start if vertices.is_cuda else 1
-        work = [new(workers, size * lanes) for size in (3 * _TILE, 3 * joints, 12 * joints)]
+        workers = worker_count(part.stop - part.start, lanes)
+        work = [working_rows(vertices, workers, size, lanes) for size in (3 * _TILE, 3 * joints, 12 * joints)]
         flat = [as_warp(one.view(-1)) for one in (point, mean, vertices)]
-        given = *map(as_warp, (start, vertex, *runs)), *flat, *map(as_warp, work)
-        with launching(vertices) as device:
-            wp.launch(
-                kernel, dim=workers,
-                inputs=[part.start, part.stop, count, vertices.shape[1], *given,
-                        as_warp(origin.view(-1)), as_warp(out.view(-1))],
-                device=device,
-            )  # fmt: skip
+        given = *map(as_warp, (start, vertex, *runs)), *flat, *map(as_rows, work)
+        counts = part.start, part.stop, count, vertices.shape[1]
+        inputs = [*counts, *given, as_warp(origin.view(-1)), as_warp(out.view(-1))]
+        launch(kernel, workers, inputs, vertices)
 
     in_threads(run, groups, vertices)
     return out, origin

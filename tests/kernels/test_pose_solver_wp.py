@@ -6,11 +6,18 @@ import pytest
 import torch
 
 from soma_core.geometry.rotations import axis_angle_to_matrix
+from soma_core.inversion import PoseInversion
 from soma_core.inversion.gauss_newton import GaussNewton
 from soma_core.inversion.model import PoseModel
 from soma_core.inversion.priors import HINGES, PosePriors, joint_terms, twist_doubt
 from soma_core.inversion.problem import Pose
-from soma_core.kernels import pose_solver_wp
+from soma_core.kernels import (
+    frame_moments_wp,
+    model_residual_wp,
+    nearest_rotation_wp,
+    pose_solver_wp,
+    skin_moments_wp,
+)
 from soma_core.layer import SomaLayer
 from tests.bodies import randn
 from tests.inversion.driven_layers import as_pose, layer_of
@@ -33,6 +40,7 @@ LEFT_OUT = 0.02
 """Relative to the largest step: small products of modes are no part of the native matrix."""
 FRAMES = 17
 DAMPINGS = (0.0, 1e-4)
+PLAIN = {"procedural": False, "correctives": None}
 
 
 def targets(count, *, who=1, dtype=torch.float64, device="cpu"):
@@ -363,3 +371,23 @@ def test_variances_are_those_of_the_reference(kind, held):
     expected, found = (model_of(kind, warp=warp).angle_variance(*given) for warp in (False, True))
     bound = LEFT_OUT if kind == "whole" else STEPS
     torch.testing.assert_close(found, expected, rtol=bound, atol=0)
+
+
+@pytest.mark.parametrize("options", [{}, PLAIN], ids=["default", "plain"])
+def test_frames_abreast_are_fitted_as_frames_in_lanes(options, monkeypatch):
+    """The layout of a GPU, one frame a group and groups abreast, here in code of the CPU."""
+    layer = SomaLayer("soma", lod="low", **options)
+    identity, count = layer.identity(), 33
+    rotations = 0.3 * randn(count, 77, 3, seed=5, dtype=torch.float32)
+    vertices = layer.pose(identity, rotations, 0.1 * randn(count, 3, seed=6, dtype=torch.float32)).vertices
+    weights = torch.ones(count, vertices.shape[1])
+    weights[1:, :200] = 0
+    fit = PoseInversion(layer, kernels="warp")
+    found = [fit(vertices, identity, weights=given) for given in (None, weights)]
+    for module in (frame_moments_wp, model_residual_wp, nearest_rotation_wp, pose_solver_wp, skin_moments_wp):
+        monkeypatch.setattr(module, "lane_count", lambda _tensor: 1)
+    again = [fit(vertices, identity, weights=given) for given in (None, weights)]
+    for wide, narrow in zip(found, again, strict=True):
+        assert narrow.converged.all()
+        assert (narrow.rotations - wide.rotations).abs().max() < 1e-3
+        assert (narrow.vertex_error - wide.vertex_error).abs().nan_to_num().max() < 5e-6
