@@ -7,6 +7,7 @@ import torch
 
 from soma_core.geometry.rotations import axis_angle_to_matrix
 from soma_core.inversion import PoseInversion
+from soma_core.inversion.fit import _CHUNK_ON_GPU
 from soma_core.inversion.gauss_newton import GaussNewton
 from soma_core.inversion.model import PoseModel
 from soma_core.inversion.priors import HINGES, PosePriors, joint_terms, twist_doubt
@@ -18,6 +19,7 @@ from soma_core.kernels import (
     pose_solver_wp,
     skin_moments_wp,
 )
+from soma_core.kernels._residual_phases import tile_slots
 from soma_core.layer import SomaLayer
 from tests.bodies import randn
 from tests.inversion.driven_layers import as_pose, layer_of
@@ -391,3 +393,12 @@ def test_frames_abreast_are_fitted_as_frames_in_lanes(options, monkeypatch):
         assert narrow.converged.all()
         assert (narrow.rotations - wide.rotations).abs().max() < 1e-3
         assert (narrow.vertex_error - wide.vertex_error).abs().nan_to_num().max() < 5e-6
+
+
+def test_memory_of_a_frame_on_a_gpu():
+    """What a chunk of frames takes there, beside its targets: a tenth of a card of 80 GB."""
+    fit = PoseInversion(SomaLayer("soma"))
+    steps = fit.model._steps
+    numbers = steps.memory + 2 * steps.kept + 2 * tile_slots().size
+    assert 4 * numbers < 320e3
+    assert 4 * numbers * _CHUNK_ON_GPU < 8e9
