@@ -1,0 +1,249 @@
+"""Bodies skinned in one pass, without gradients; bodies in SIMD lanes (paper, equations 5 and 6).
+
+Tile by tile of vertices: rest points, brought to the bind pose where asked for, what the correctives add, and
+skinning. Nothing but posed vertices is written. The twin of ``animation.skinning`` for a CPU.
+"""
+
+import functools
+from typing import NamedTuple
+
+import scipy.sparse
+import torch
+import warp as wp
+from torch import Tensor
+
+from soma_core.kernels._lanes import as_rows, in_threads, launch, row_of, worker_count, working_rows
+from soma_core.kernels._native import native, transposing
+from soma_core.kernels._runtime import as_warp, scalar_name
+
+__all__ = ["Blend", "blend_of", "skin_bodies"]
+
+_TILE = 64
+"""Vertices treated together: their points stay in the first cache."""
+
+_WIDTHS = {torch.float32: (4, 8, 16), torch.float64: (4, 8)}
+"""Bodies a thread may treat at once: SIMD registers of current CPUs, wide ones split where there are none."""
+
+_ids, _short = wp.array(dtype=wp.int32), wp.array(dtype=wp.int16)
+
+
+class Blend(NamedTuple):
+    """A sparse matrix as the kernel reads it.
+
+    Attributes:
+        start: row starts, int32.
+        column: ids (e,), int16.
+        value: (e,), or (e, 3) of rows of three.
+    """
+
+    start: Tensor
+    column: Tensor
+    value: Tensor
+
+
+def blend_of(matrix: scipy.sparse.csr_array, *, dtype: torch.dtype, rows: int = 1) -> Blend:
+    """Tables of a matrix (rows v, n), with the `rows` of one vertex together."""
+    matrix = matrix.tocsr().sorted_indices()
+    if rows > 1:
+        matrix = matrix.tobsr((rows, 1)).sorted_indices()
+    assert matrix.shape[1] < 2**15, matrix.shape
+    return Blend(
+        torch.as_tensor(matrix.indptr.copy(), dtype=torch.int32),
+        torch.as_tensor(matrix.indices.copy(), dtype=torch.int16),
+        torch.as_tensor(matrix.data.reshape(-1).copy()).to(dtype),
+    )
+
+
+@wp.struct
+class _Task:
+    """Counts and switches of one launch: groups begin .. end of bodies, tiles first .. stop of vertices."""
+
+    begin: int
+    end: int
+    first: int
+    stop: int
+    bodies: int
+    vertices: int
+    joints: int
+    reposed: int
+    activations: int
+
+
+@wp.struct
+class _Strides:
+    """Numbers from one body, one vertex, one axis of the points to the next."""
+
+    body: wp.int64
+    vertex: wp.int64
+    axis: wp.int64
+
+
+@functools.cache
+def _kernel(scalar: str, lanes: int):
+    width, size = lanes, _TILE
+    real, rows = wp.array(dtype=getattr(wp, scalar)), wp.array3d(dtype=getattr(wp, scalar))
+    (load, store), row = transposing(scalar, lanes), row_of(scalar)
+    draw, move, skin = _steps(real, scalar, lanes)
+    module = wp.get_module(f"soma_body_skin_{scalar}_{lanes}")
+
+    @wp.kernel(module=module, enable_backward=False)
+    def run(
+        task: _Task, by: _Strides,
+        skin_start: _ids, skin_joint: _short, skin_value: real,
+        first_start: _ids, first_joint: _short, first_value: real,
+        move_start: _ids, move_id: _short, move_value: real,
+        points: real, transforms: real, before: real, active: real,
+        turns: rows, firsts: rows, sources: rows, tiles: rows, out: real,
+    ):  # fmt: skip
+        w = wp.tid()
+        turn, first, source, tile = row(turns, w), row(firsts, w), row(sources, w), row(tiles, w)
+        last = task.bodies - 1
+        numbers, own = 12 * task.joints, 12 * task.reposed
+        for g in range(task.begin + w, task.end, tiles.shape[0] * tiles.shape[1]):
+            f = g * width
+            load(transforms, wp.int64(numbers), 0, numbers, f, last, turn, 0)
+            load(before, wp.int64(own), 0, own, f, last, first, 0)
+            load(active, wp.int64(task.activations), 0, task.activations, f, last, source, 0)
+            for t in range(task.first, task.stop):
+                a = t * size
+                b = wp.min(a + size, task.vertices)
+                draw(points, by.body, by.vertex, by.axis, f, last, a, b, tile)
+                if task.reposed > 0:
+                    skin(first_start, first_joint, first_value, first, a, b, tile)
+                if task.activations > 0:
+                    move(move_start, move_id, move_value, source, a, b, tile)
+                skin(skin_start, skin_joint, skin_value, turn, a, b, tile)
+                store(tile, 0, 3 * (b - a), out, wp.int64(3 * task.vertices), 3 * a, f, last)
+
+    return run
+
+
+def _steps(real, scalar: str, lanes: int):
+    def draw(
+        source: real, body: wp.int64, vertex: wp.int64, axis: wp.int64, first: int, last: int,
+        begin: int, stop: int, tile: real,
+    ):  # fmt: skip
+        ...
+
+    def move(start: _ids, column: _short, value: real, active: real, first: int, stop: int, tile: real): ...
+
+    def skin(
+        start: _ids, joint: _short, value: real, transforms: real, first: int, stop: int, tile: real
+    ): ...
+
+    bodies = {draw: _DRAW, move: _MOVE, skin: _SKIN}
+    for stub in bodies:
+        stub.__name__ += "_bodies"
+    return tuple(native(body, scalar, lanes, stub) for stub, body in bodies.items())
+
+
+_DRAW = """
+    M x = (M)tile.data;
+    for (int v = begin; v < stop; v++)
+        for (int r = 0; r < 3; r++, x += 1) {
+            const R* p = source.data + v * vertex + r * axis;
+            if (body == 0) *x = V{} + *p;
+            else if (body == 1 && first + N <= last + 1) *x = *(const V*)(p + first);
+            else {
+                V found = V{};
+                for (int c = 0; c < N; c++) ((R*)&found)[c] = p[(first + c < last ? first + c : last) * body];
+                *x = found;
+            }
+        }
+"""
+
+_MOVE = """
+    M a = (M)active.data, x = (M)tile.data;
+    for (int v = first; v < stop; v++, x += 3) {
+        V p = x[0], q = x[1], r = x[2];
+        for (int e = start.data[v]; e < start.data[v + 1]; e++) {
+            const R* by = value.data + 3 * e;
+            const V b = a[column.data[e]];
+            p += by[0] * b;
+            q += by[1] * b;
+            r += by[2] * b;
+        }
+        x[0] = p;
+        x[1] = q;
+        x[2] = r;
+    }
+"""
+
+_SKIN = """
+    M transform = (M)transforms.data, x = (M)tile.data;
+    for (int v = first; v < stop; v++, x += 3) {
+        V m[12];
+        for (int k = 0; k < 12; k++) m[k] = V{};
+        for (int e = start.data[v]; e < start.data[v + 1]; e++) {
+            M t = transform + 12 * joint.data[e];
+            const R w = value.data[e];
+            for (int k = 0; k < 12; k++) m[k] += w * t[k];
+        }
+        const V p = x[0], q = x[1], r = x[2];
+        for (int i = 0; i < 3; i++) x[i] = m[4 * i] * p + m[4 * i + 1] * q + m[4 * i + 2] * r + m[4 * i + 3];
+    }
+"""
+
+
+def skin_bodies(
+    points: Tensor, transforms: Tensor, skin: Blend, *, before: Tensor | None = None,
+    first: Blend | None = None, active: Tensor | None = None, moves: Blend | None = None,
+    out: Tensor | None = None,
+) -> Tensor:  # fmt: skip
+    """Skinned vertices (B, v, 3) [m], contiguous.
+
+    Args:
+        points: rest points (B or 1, v, 3) [m], in any layout; best with bodies innermost.
+        transforms: (B, T, 3, 4).
+        skin: weights (v, T).
+        before: transforms (B, J, 3, 4) that take points to the bind pose first; None of what is there.
+        first: weights (v, J) of these.
+        active: activations of the correctives (B, A), times the body's size; None without.
+        moves: offsets (3 v, A) of these, in rows of three.
+        out: where to write; None for new memory.
+    """
+    count, vertices = len(transforms), points.shape[1]
+    if out is None:
+        out = points.new_empty(count, vertices, 3)
+    if not out.numel():
+        return out
+    lanes, tiles = _lanes(count, points), -(-vertices // _TILE)
+    groups, threads = -(-count // lanes), torch.get_num_threads()
+    shares = max(1, min(threads // groups, tiles))  # of the tiles, where there are more threads than groups
+    kernel, none = _kernel(scalar_name(points.dtype), lanes), points.new_zeros(1)
+    blends = [skin, first or skin, moves or skin]
+    frames = [none if one is None else one.contiguous() for one in (transforms, before, active)]
+    strides = _Strides()
+    strides.body, strides.vertex, strides.axis = points.stride()
+    if len(points) == 1:
+        strides.body = 0
+    sizes = 12 * transforms.shape[1], 12 * (0 if before is None else before.shape[1])
+    sizes += (0 if active is None else active.shape[1], 3 * _TILE)
+
+    def run(part: slice) -> None:  # of more than one share, a part is one of them
+        task, share = _Task(), part.start % shares
+        task.begin, task.end = part.start // shares, -(-part.stop // shares)
+        task.first, task.stop = tiles * share // shares, tiles * (share + 1) // shares
+        task.bodies, task.vertices, task.joints = count, vertices, transforms.shape[1]
+        task.reposed, task.activations = sizes[1] // 12, sizes[2]
+        workers = worker_count(task.end - task.begin, lanes)
+        work = [working_rows(points, workers, max(size, 1), lanes) for size in sizes]
+        tables = [as_warp(one) for blend in blends for one in blend]
+        start = as_warp(points.as_strided((1,), (1,)))
+        given = [
+            start,
+            *(as_warp(one.view(-1)) for one in frames),
+            *map(as_rows, work),
+            as_warp(out.view(-1)),
+        ]
+        launch(kernel, workers, [task, strides, *tables, *given], points)
+
+    in_threads(run, groups * shares, points)
+    return out
+
+
+def _lanes(count: int, like: Tensor) -> int:
+    """Bodies a thread treats at once: as few as keep every thread busy, as many as a register holds."""
+    share = -(-count // torch.get_num_threads())
+    widths = _WIDTHS[like.dtype]
+    return next((width for width in widths if width >= share), widths[-1])
