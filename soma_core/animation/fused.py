@@ -11,18 +11,10 @@ from soma_core.animation.patches import Patches, side_by_side
 from soma_core.animation.posed import Posed
 from soma_core.animation.twist import Twist
 from soma_core.correctives.model import Correctives
-from soma_core.geometry.torch_func import transformed
 from soma_core.kernels._posing_text import BODY_INTS, BODY_REALS, JOINT_LIMIT
 from soma_core.skeleton.identity import Identity
 
-__all__ = ["FusedPose", "untracked"]
-
-
-def untracked(*given: Tensor | None) -> bool:
-    """Whether no derivative, transform or compiler follows what is computed from these tensors."""
-    if torch.compiler.is_compiling() or transformed():
-        return False
-    return not (torch.is_grad_enabled() and any(part is not None and part.requires_grad for part in given))
+__all__ = ["FusedPose"]
 
 
 class FusedPose(torch.nn.Module):

@@ -100,7 +100,8 @@ def _bounds(blends: Sequence[np.ndarray], moves: Sequence[np.ndarray]) -> np.nda
         first, size = bounds[-1], min(PATCH_VERTICES, count - bounds[-1])
         while size:
             used = [
-                len(np.unique(ids[starts[first] : starts[first + size]])) for starts, ids, _ in (blends, moves)
+                len(np.unique(ids[starts[first] : starts[first + size]]))
+                for starts, ids, _ in (blends, moves)
             ]
             if used[0] <= PATCH_JOINTS and used[1] <= PATCH_ACTIVATIONS:
                 break
