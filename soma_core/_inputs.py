@@ -82,9 +82,18 @@ def _check_finite(name: str, value: Tensor) -> None:
 
 
 def check_rotations(
-    rotations: Tensor, joint_count: int, dtype: torch.dtype, device: torch.device, *, validate: bool
+    rotations: Tensor,
+    joint_count: int,
+    dtype: torch.dtype,
+    device: torch.device,
+    *,
+    validate: bool,
+    convert: bool = True,
 ) -> Tensor:
-    """Matrices (batch, joints, 3, 3) from axis-angle or matrices, or a clear refusal."""
+    """Matrices (batch, joints, 3, 3) from axis-angle or matrices, or a clear refusal.
+
+    Without `convert`, axis-angle comes out as it is: (batch, joints, 3).
+    """
     rotations = widened(rotations, dtype)
     check_kind("rotations", rotations, dtype, device)
     shape = tuple(rotations.shape)
@@ -98,7 +107,7 @@ def check_rotations(
         )
     _check_finite("rotations", rotations)
     if axis_angle:
-        return axis_angle_to_matrix(rotations)
+        return axis_angle_to_matrix(rotations) if convert else rotations
     if validate and may_look(rotations):
         _check_orthonormal(rotations.detach())
     return rotations

@@ -20,13 +20,15 @@ from soma_core._inputs import (
     check_translation,
 )
 from soma_core.animation.engine import Animation, Body, ProceduralAnimation
+from soma_core.animation.fused import FusedPose
 from soma_core.animation.kinematics import relative_from_absolute
 from soma_core.animation.posed import Posed
 from soma_core.backends.parameters import batch_parameters
 from soma_core.backends.rest_shape import make_rest_shape
 from soma_core.correctives.model import find_correctives, load_correctives
 from soma_core.errors import InputError
-from soma_core.geometry.torch_func import transformed
+from soma_core.geometry.rotations import axis_angle_to_matrix
+from soma_core.geometry.torch_func import transformed, untracked
 from soma_core.plugin.registry import Registry, default_registry
 from soma_core.rig import load_canonical
 from soma_core.rig.mesh import CanonicalMesh, Lod
@@ -123,6 +125,19 @@ class SomaLayer(Derived):
         self.correctives = load_correctives(
             self.correctives_file, self.mesh, self.rig, dtype=dtype, device=device
         )
+        self.fused: FusedPose | None = None
+        if device.type == "cuda" and self.kernels != "torch":
+            self.fuse()
+
+    def fuse(self) -> None:
+        """Let few kernels do what no gradient is asked of, as a layer on CUDA does; no derivative is lost.
+
+        On the CPU, where it serves tests, the kernels run on one core.
+        """
+        fused = FusedPose(self.posing, self.correctives, dtype=self.dtype, device=self.device)
+        self.fused = fused if fused.fits else None
+        self.animation.fuse()
+        self.rest_shape.fit.rotations.fused = True
 
     def extra_repr(self) -> str:
         """What was chosen, for ``repr``."""
@@ -215,6 +230,10 @@ class SomaLayer(Derived):
     @own_precision
     def pose_checked(self, body: Body, *, absolute: bool = False) -> Posed:
         """:meth:`pose` without its checks, of rotation matrices: for loops that check once."""
+        if self._fusible(*body[:4]):
+            assert self.fused is not None
+            return self.fused(*body[:3], absolute=absolute, bone_scale=body.bone_scale)
+        body = body._replace(relative=_matrices(body.relative))
         moves = self._offsets(body.identity, body.relative, absolute=absolute)
         return self.posing.pose(*body[:3], absolute=absolute, bone_scale=body.bone_scale, offsets=moves)
 
@@ -234,7 +253,14 @@ class SomaLayer(Derived):
         of the vertices is what twist joints and correctives add.
         """
         _, relative, shift, scale, _ = self._body(identity, rotations, translation, bone_scale)
-        return self.animation.pose(identity, relative, shift, absolute=absolute, bone_scale=scale)
+        return self.animation.pose(identity, _matrices(relative), shift, absolute=absolute, bone_scale=scale)
+
+    def _fusible(
+        self, identity: Identity, relative: Tensor, translation: Tensor, bone_scale: Tensor | None
+    ) -> bool:
+        """Whether the kernels without a derivative may pose these bodies."""
+        given = identity.rest, identity.bind_world, relative, translation, bone_scale
+        return self.fused is not None and untracked(*given)
 
     @own_precision
     def helper_transforms(
@@ -263,14 +289,16 @@ class SomaLayer(Derived):
     def _body(
         self, identity: Identity, rotations: Tensor, translation: Tensor | None, bone_scale: Tensor | None
     ) -> Body:
-        """The arguments of `pose`, checked and brought to one batch size."""
+        """The arguments of `pose`, checked and brought to one batch size; matrices, if not :meth:`_fusible`."""
         relative = check_rotations(
-            rotations, len(self.joint_names), self.dtype, self.device, validate=self.validate
+            rotations, len(self.joint_names), self.dtype, self.device, validate=self.validate, convert=False
         )
         self.check_identity(identity)
         batch = _common_batch(identity.batch_size, len(relative))
         shift = check_translation(translation, batch, self.dtype, self.device)
         bone_scale = check_bone_scale(bone_scale, batch, len(self.joint_names), self.dtype, self.device)
+        if not self._fusible(identity, relative, shift, bone_scale):
+            relative = _matrices(relative)
         return Body(identity, relative.expand(batch, *relative.shape[1:]), shift, bone_scale)
 
     def check_identity(self, identity: Identity) -> None:
@@ -305,8 +333,10 @@ class SomaLayer(Derived):
         """
         batch = batch_parameters(self.spec, params, device=self.device, dtype=self.dtype)
         relative = check_rotations(
-            rotations, len(self.joint_names), self.dtype, self.device, validate=self.validate
+            rotations, len(self.joint_names), self.dtype, self.device, validate=self.validate, convert=False
         )
+        if self.fused is None:
+            relative = _matrices(relative)
         identities = len(next(iter(batch.values()), relative))
         size = _common_batch(identities, len(relative))
         shift = check_translation(translation, size, self.dtype, self.device)
@@ -316,6 +346,7 @@ class SomaLayer(Derived):
         tracked = torch.is_grad_enabled() and any(tensor.requires_grad for tensor in given)
         tracked = tracked or torch.compiler.is_compiling() or transformed()  # a compiler plans its own memory
         whole = tracked or identities < size or size <= _CHUNK or self.animation.warp_skinning
+        whole = whole or self.fused is not None
         if whole:
             identity = self._identity(batch, *self.rest_shape(batch))
             return self.pose_checked(Body(identity, relative, shift, bone_scale), absolute=absolute)
@@ -332,6 +363,11 @@ class SomaLayer(Derived):
 
     if TYPE_CHECKING:  # torch says that a module returns anything
         __call__ = forward
+
+
+def _matrices(rotations: Tensor) -> Tensor:
+    """Matrices (..., 3, 3) from checked rotations of either form, (B, J - 1, 3) or (B, J - 1, 3, 3)."""
+    return axis_angle_to_matrix(rotations) if rotations.ndim == 3 else rotations
 
 
 def _common_batch(identities: int, poses: int) -> int:

@@ -9,10 +9,11 @@ import torch
 from torch import Tensor
 
 from soma_core.animation.kinematics import Kinematics, relative_from_absolute, to_homogeneous
+from soma_core.animation.patches import Patches
 from soma_core.animation.posed import Posed
 from soma_core.animation.skinning import Skinning, skinning_transforms
 from soma_core.animation.twist import Twist
-from soma_core.geometry.torch_func import transformed
+from soma_core.geometry.torch_func import transformed, untracked
 from soma_core.rig.skeleton import Rig
 from soma_core.skeleton.identity import Identity
 
@@ -46,6 +47,14 @@ class Animation(torch.nn.Module):
         self.kinematics = Kinematics(rig, dtype=dtype, device=device, warp=kernels != "torch")
         self.skinning = Skinning(rig.weights, dtype=dtype, device=device)
         self.posed_skinning = self.skinning
+        self.patches: Patches | None = None
+
+    def fuse(self) -> None:
+        """Make :meth:`repose` two kernels where no gradient is asked: what a GPU takes."""
+        weights, kinematics = self.skinning.weights, self.kinematics
+        device, dtype = kinematics.orient.device, kinematics.orient.dtype
+        patches = Patches(weights.scipy(), None, dtype=dtype, device=device)
+        self.patches = patches if patches.fits else None
 
     def repose(self, points: Tensor, fitted: Tensor) -> tuple[Tensor, Tensor]:
         """Bring fitted bodies to the rig's bind pose.
@@ -57,6 +66,8 @@ class Animation(torch.nn.Module):
         Returns:
             Planes (3, v, B) and world transforms (B, J, 4, 4) in the bind pose; the Hips stay in place.
         """
+        if self.patches is not None and untracked(points, fitted):
+            return self._repose_fused(self.patches, points, fitted)
         kinematics = self.kinematics
         positions = kinematics.bind_positions(kinematics.local_offsets(fitted), fitted[:, 1, :3, 3])
         rotations = kinematics.bind_rotation.expand(len(fitted), -1, 3, 3)
@@ -66,6 +77,17 @@ class Animation(torch.nn.Module):
         else:
             skinned = self.skinning(points, transforms, rows=False)
         return skinned, to_homogeneous(rotations, positions)
+
+    def _repose_fused(self, patches: Patches, points: Tensor, fitted: Tensor) -> tuple[Tensor, Tensor]:
+        from soma_core.kernels.fused_pose_wp import skin_patches
+        from soma_core.kernels.identity_wp import to_bind_pose
+
+        kinematics = self.kinematics
+        constants = kinematics.bind_rotation, kinematics.parent_orient, kinematics.bind_parent_turn
+        world, skin = to_bind_pose(fitted, kinematics.tree, *constants)
+        tables = patches.ints, patches.shorts, patches.reals
+        rest = skin_patches(points.permute(2, 1, 0), skin, None, *tables, patches=patches.count)
+        return rest.permute(2, 1, 0), world
 
     def bone_vectors(self, identity: Identity, bone_scale: Tensor | None = None) -> Tensor:
         """Bone vectors in T-pose world axes, (B, J, 3) [m], times `bone_scale` (1 or B, J - 1)."""

@@ -106,9 +106,12 @@ class ComposedRestShape(torch.nn.Module):
         """Vertices as planes (3, v, B) [m] and fitted transforms (B, J, 4, 4) [m]."""
         coefficients = self.coefficients(params)
         rows = coefficients
-        if len(rows) == 1:  # MKL multiplies by two columns three times faster than by one
-            rows = torch.cat((rows, rows))
-        stacked = torch.addmm(self.template, self.basis, rows.T)[:, : len(coefficients)]
+        if rows.is_cuda:  # a body's numbers lie together, as the kernels that follow read them
+            stacked = torch.addmm(self.template.T, rows, self.basis.T).T
+        else:
+            if len(rows) == 1:  # MKL multiplies by two columns three times faster than by one
+                rows = torch.cat((rows, rows))
+            stacked = torch.addmm(self.template, self.basis, rows.T)[:, : len(coefficients)]
         size = 3 * self.vertex_count
         points = stacked[:size].unflatten(0, (3, self.vertex_count))
         moments = stacked[size:].unflatten(0, (4 * self.fit.joint_count, 3))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -60,12 +59,14 @@ class Correctives(torch.nn.Module):
         self.first = SparseRows(weights.first.T.tocsr()[used], dtype=dtype, device=device)
         self.second = SparseRows(second[:, used].tocsr(), dtype=dtype, device=device)
         self.owner = used // weights.channels
-        self._above = rig.parents[2:].tolist()  # a list: torch.compile takes NumPy for values it cannot know
+        # A tensor: a list would be copied to a GPU at each call, and torch.compile does not know NumPy's values.
+        above = torch.as_tensor(rig.parents[2:].astype(np.int64), device=device)
+        self.register_buffer("above", above, persistent=False)
         self.length = float(skeleton_length(torch.as_tensor(rig.bind_world.copy())[None], rig))
 
     def scale(self, bind_world: Tensor) -> Tensor:
         """How large bodies are beside the canonical one, (B,), by the length of their bones."""
-        return _bone_sum(bind_world, self._above) / self.length
+        return _bone_sum(bind_world, self.above) / self.length
 
     def forward(self, relative: Tensor, bind_world: Tensor) -> Tensor:
         """Offsets (B, v, 3) [m] of rest shapes in the bind pose. Differentiable.
@@ -85,10 +86,11 @@ class Correctives(torch.nn.Module):
 
 def skeleton_length(bind_world: Tensor, rig: Rig) -> Tensor:
     """Sum of all bones below the Hips [m], (B,), of bind transforms (B, J, 4, 4)."""
-    return _bone_sum(bind_world, rig.parents[2:].tolist())
+    above = torch.as_tensor(rig.parents[2:].astype(np.int64), device=bind_world.device)
+    return _bone_sum(bind_world, above)
 
 
-def _bone_sum(bind_world: Tensor, above: Sequence[int]) -> Tensor:
+def _bone_sum(bind_world: Tensor, above: Tensor) -> Tensor:
     places = bind_world[..., :3, 3]
     return (places[:, 2:] - places[:, above]).norm(dim=-1).sum(1)
 

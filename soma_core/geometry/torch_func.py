@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import torch
+from torch import Tensor
 from torch.autograd import forward_ad
 
-__all__ = ["transformed"]
+__all__ = ["transformed", "untracked"]
 
 
 def transformed() -> bool:
@@ -19,3 +20,10 @@ def transformed() -> bool:
     if torch.compiler.is_compiling():
         return False
     return forward_ad._current_level >= 0 or torch._C._are_functorch_transforms_active()
+
+
+def untracked(*given: Tensor | None) -> bool:
+    """Whether no derivative, transform or compiler follows what is computed from these tensors."""
+    if torch.compiler.is_compiling() or transformed():
+        return False
+    return not (torch.is_grad_enabled() and any(part is not None and part.requires_grad for part in given))

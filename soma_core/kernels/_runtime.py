@@ -72,13 +72,24 @@ def as_warp(tensor: torch.Tensor, dtype: Any = None) -> Any:
     return wp.from_torch(tensor, dtype=dtype, requires_grad=False, return_ctype=True)
 
 
+@functools.lru_cache(maxsize=64)
+def _stream(device: str, handle: int) -> Any:
+    """Warp's name for a stream of torch's; made once, since that registers it and makes an event for it."""
+    return wp.Stream(device, cuda_stream=handle)
+
+
 @contextlib.contextmanager
 def launching(tensor: torch.Tensor) -> Iterator[Any]:
-    """The device to launch on; on CUDA, within torch's current stream, so that both see one order of work."""
+    """The device to launch on; on CUDA, within torch's current stream, so that both see one order of work.
+
+    Nothing waits for the stream that Warp used before: nothing is ever put on Warp's own, and to wait for it
+    would end the capture of a CUDA graph (Warp 1.19 records an event outside of the capture for it).
+    """
     start()
     device = wp.device_from_torch(tensor.device)
     if not tensor.is_cuda:
         yield device
         return
-    with wp.ScopedStream(wp.stream_from_torch(torch.cuda.current_stream(tensor.device))):
+    handle = torch.cuda.current_stream(tensor.device).cuda_stream
+    with wp.ScopedStream(_stream(device.alias, handle), sync_enter=False):
         yield device

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from soma_core.geometry.sparse import SparseRows
+from soma_core.geometry.torch_func import untracked
 from soma_core.rig.mesh import CanonicalMesh
 from soma_core.rig.skeleton import Rig
 from soma_core.skeleton.joints import joint_regressor
@@ -69,6 +70,8 @@ class SkeletonFit(torch.nn.Module):
         self.joint_count = rig.joint_count
         self.moments = SparseRows(self.matrix, dtype=dtype, device=device)
         self.rotations = RotationFit(rig, dtype=dtype, device=device, warp=warp)
+        bottom = torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=dtype, device=device)
+        self.register_buffer("bottom", bottom, persistent=False)
 
     def forward(self, vertices: Tensor) -> Tensor:
         """World transforms (B, J, 4, 4) [m] of the joints, from vertices (B, v, 3) [m]. Differentiable."""
@@ -80,7 +83,9 @@ class SkeletonFit(torch.nn.Module):
     def from_moments(self, moments: Tensor) -> Tensor:
         """World transforms (B, J, 4, 4) from moments (B, J, 4, 3): position, then covariance columns."""
         joints, covariances = moments[:, :, 0], moments[:, :, 1:].transpose(-1, -2)
+        if self.rotations.fused and untracked(moments):
+            return self.rotations.world(joints, covariances)
         rotations = self.rotations(joints, covariances)
         top = torch.cat((rotations, joints[..., None]), -1)
-        bottom = top.new_tensor([0.0, 0.0, 0.0, 1.0]).expand(*top.shape[:2], 1, 4)
+        bottom = self.bottom.expand(*top.shape[:2], 1, 4)
         return torch.cat((top, bottom), -2)

@@ -62,6 +62,9 @@ class RotationFit(torch.nn.Module):
     Args:
         rig: joints and bind pose.
         warp: run the Warp twin instead of the torch reference.
+
+    Attributes:
+        fused: whether :meth:`world` stands in for :meth:`forward` where no gradient is asked.
     """
 
     def __init__(
@@ -69,6 +72,7 @@ class RotationFit(torch.nn.Module):
     ) -> None:
         super().__init__()
         self.warp = warp
+        self.fused = warp and torch.device(device).type == "cuda"
         plan = alignment_plan(rig)
         table, bind = plan.child_table, rig.bind_world[:, :3, 3]
         single, several = np.flatnonzero(table[:, 1] < 0), np.flatnonzero(table[:, 1] >= 0)
@@ -112,6 +116,14 @@ class RotationFit(torch.nn.Module):
         eye = torch.eye(3, dtype=joints.dtype, device=joints.device).expand(len(joints), 1, 3, 3)
         world = torch.cat((eye, displacement), 1)[:, self.source] @ self.bind_rotation
         return 1.5 * world - 0.5 * world @ (world.transpose(-1, -2) @ world)  # undo the products' rounding
+
+    def world(self, joints: Tensor, covariances: Tensor) -> Tensor:
+        """World transforms (B, J, 4, 4) [m] by kernels alone; takes what :meth:`forward` does. No derivative."""
+        from soma_core.kernels.identity_wp import fitted_world
+        from soma_core.kernels.skeleton_fit_wp import fit_displacements
+
+        turns = fit_displacements(joints, covariances, self.bind, self.pivots, self.child_table)
+        return fitted_world(turns, self.source, self.bind_rotation, joints)
 
     def displacements(self, joints: Tensor, covariances: Tensor, bones: Tensor) -> Tensor:
         """Turns (B, p, 3, 3) of the pivots that take `bones`, each from a joint's parent, to `joints`.
