@@ -1,11 +1,12 @@
 """Correctness and speed on a GPU, in one go: what is known so far is on disk after every row.
 
-    python benchmarks/gpu.py --device cuda --out FOLDER --peer PEER     everything, at most six minutes
+    python benchmarks/gpu.py --device cuda --out FOLDER --peer PEER     everything, in six minutes
     python benchmarks/gpu.py --device cpu --quick --out FOLDER          the same at toy sizes
     python benchmarks/gpu.py --table FOLDER/gpu.json                    its table, into benchmarks/README.md
 
-This process only watches: the sections run in another one. Where that one dies or hangs, a new one goes on after
-the row that was its end. PEER is a folder with ``site`` (py-soma-x); its assets are made there when first needed.
+This process only watches: the sections run in another one. Where that one dies or hangs, a new one goes on
+after the row that was its end. PEER is a folder with ``site`` (py-soma-x); its assets are made there when first
+needed. On CUDA all kernels are compiled first, in as many processes as there are cores.
 """
 
 from __future__ import annotations
@@ -21,18 +22,19 @@ import time
 from pathlib import Path
 
 from gpu_table import gpu_table, short_table
+from gpu_warm import warm
 from processes import HERE, ROOT, short_commit
 
 __all__ = ["SECTIONS", "main"]
 
 SECTIONS = {
     "machine": ("gpu_checks", 0.1),
-    "kernels": ("gpu_kernels", 0.4),
-    "layer": ("gpu_checks", 0.25),
-    "fit": ("gpu_checks", 0.25),
+    "kernels": ("gpu_kernels", 0.25),
+    "layer": ("gpu_checks", 0.15),
+    "fit": ("gpu_checks", 0.2),
     "table4": ("gpu_speed", 0.25),
     "graph": ("gpu_speed", 0.15),
-    "inversion": ("gpu_speed", 0.3),
+    "inversion": ("gpu_speed", 0.35),
     "peer": ("gpu_peer", 0.25),
     "after": ("gpu_checks", 0.1),
 }
@@ -40,6 +42,8 @@ SECTIONS = {
 SILENT_S = {"cuda": 100.0, "cpu": 400.0}
 """A process that stores nothing for so long hangs."""
 ATTEMPTS = 12
+WARM_SHARE = 0.4
+"""Of the budget, at most, for compiling."""
 
 
 def parse(arguments: list[str] | None = None) -> argparse.Namespace:
@@ -54,6 +58,7 @@ def parse(arguments: list[str] | None = None) -> argparse.Namespace:
     parser.add_argument("--peer", type=Path, help="folder with site/ and assets/ of py-soma-x")
     parser.add_argument("--commit", default="", help="where git is not there to tell")
     parser.add_argument("--table", type=Path, help="a gpu.json whose table is wanted")
+    parser.add_argument("--warm", choices=["yes", "no", "only"], default="yes", help="compile first (CUDA)")
     parser.add_argument("--worker", type=Path, help=argparse.SUPPRESS)
     return parser.parse_args(arguments)
 
@@ -157,6 +162,13 @@ def main() -> None:
         sys.stdout.write(text + "\n")
         return
     path = begin(options)
+    if options.device == "cuda" and options.warm != "no":
+        state = _load(path)
+        state["compile"] = warm(options.device, state["started"] + WARM_SHARE * options.seconds_budget)
+        path.write_text(json.dumps(state, indent=1) + "\n", encoding="utf-8")
+        sys.stdout.write(f"compiled: {json.dumps(state['compile'])[:1500]}\n")
+        if options.warm == "only":
+            return
     watch(options, path)
     state = _load(path)
     sys.stdout.write(f"{short_table(state)}\n{path}\n")

@@ -1,4 +1,4 @@
-"""Rows of the device benchmark: each is stored as soon as it is known, and survives whatever comes after it."""
+"""Rows of the device benchmark: each is stored as soon as it is known, and outlives what comes after it."""
 
 from __future__ import annotations
 
@@ -18,6 +18,9 @@ __all__ = ["SICK", "Bench", "load_state", "store_state"]
 
 SICK = 3
 """Exit code of a process whose CUDA context is lost; the rest goes on in a new one."""
+
+LONG_S = 6.0
+"""A call that takes longer is measured once."""
 
 Row = dict[str, Any]
 
@@ -132,24 +135,33 @@ class Bench:
             torch.cuda.synchronize()
 
     def timed(
-        self, call: Callable[[int], Any], *, sets: int = 1, seconds: float = 0.5, least: int = 5, most: int = 200
+        self,
+        call: Callable[[int], Any],
+        *,
+        sets: int = 1,
+        seconds: float = 0.3,
+        most: int = 200,
+        warm: bool = True,
     ) -> Row:
         """Median and quartiles [ms] of ``call(i)``, where `i` runs through sets of inputs, after a warm-up.
 
         Args:
-            seconds: about how long to measure.
-            least, most: launches; calls of more than a second are measured twice.
+            seconds: about how long to measure; five launches at least, of long calls two or one.
+            most: launches.
+            warm: call each set first; False where that was done.
         """
-        if self.quick:
-            seconds, least = 0.05, 2
-        for i in range(sets):
+        least = 2 if self.quick else 5
+        seconds = 0.02 if self.quick else seconds
+        for i in range(sets if warm else 0):
             call(i)
         self.wait()
         begin = time.perf_counter()
         call(0)
         self.wait()
         once = time.perf_counter() - begin
-        count = 2 if once > 1 else max(least, min(most, int(seconds / max(once, 1e-6))))
+        if once > LONG_S:
+            return {"ms": 1e3 * once, "p25_ms": 1e3 * once, "p75_ms": 1e3 * once, "launches": 1}
+        count = 2 if once > 0.5 else max(least, min(most, int(seconds / max(once, 1e-6))))
         begin = time.perf_counter()
         times = self._by_events(call, sets, count) if self.cuda else _by_clock(call, sets, count)
         whole = 1e3 * (time.perf_counter() - begin) / count
@@ -167,15 +179,19 @@ class Bench:
 
     def peak(self, call: Callable[[int], Any]) -> Row:
         """Most memory [MB] that torch held during one call, and what it held before; empty on the CPU."""
+        return self.peaked(call)[0] if self.cuda else {}
+
+    def peaked(self, call: Callable[[int], Any]) -> tuple[Row, Any]:
+        """:meth:`peak`, and what the call returned."""
         if not self.cuda:
-            return {}
+            return {}, call(0)
         torch.cuda.synchronize()
         torch.cuda.empty_cache()
         before = torch.cuda.memory_allocated()
         torch.cuda.reset_peak_memory_stats()
-        call(0)
+        found = call(0)
         torch.cuda.synchronize()
-        return {"peak_mb": torch.cuda.max_memory_allocated() / 1e6, "held_mb": before / 1e6}
+        return {"peak_mb": torch.cuda.max_memory_allocated() / 1e6, "held_mb": before / 1e6}, found
 
 
 def _by_clock(call: Callable[[int], Any], sets: int, count: int) -> list[float]:

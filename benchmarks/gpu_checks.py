@@ -50,12 +50,12 @@ def machine(bench: Bench) -> None:
 
 
 def _versions() -> dict:
-    import numpy
+    import numpy as np
     import scipy
     import warp
 
     found = {"python": platform.python_version(), "torch": torch.__version__, "warp": warp.config.version,
-             "numpy": numpy.__version__, "scipy": scipy.__version__, "cuda": torch.version.cuda,
+             "numpy": np.__version__, "scipy": scipy.__version__, "cuda": torch.version.cuda,
              "cpu": cpu_name(), "threads": torch.get_num_threads(), "command": sys.executable,
              "tf32": torch.backends.cuda.matmul.allow_tf32}  # fmt: skip
     if torch.cuda.is_available():
@@ -92,7 +92,7 @@ def _compiled(bench: Bench) -> dict:
     calls = {
         "forward": lambda: made(params, poses, shift),
         "backward": lambda: made(params, poses.requires_grad_(), shift).vertices.sum().backward(),
-        "fit": lambda: _fitted(low, "default", 4),
+        "fit": lambda: _fitted(low, 4),
     }
     for name, call in calls.items():
         for which in ("first", "second"):
@@ -103,7 +103,7 @@ def _compiled(bench: Bench) -> dict:
     return found
 
 
-def _fitted(layer: SomaLayer, kind: str, count: int) -> dict:
+def _fitted(layer: SomaLayer, count: int) -> dict:
     identity, seen, truth = targets(layer, count)
     return judged(layer, identity, seen, truth, PoseInversion(layer)(seen, identity))
 

@@ -36,7 +36,7 @@ class Twin:
     """One kernel, and its reference.
 
     Attributes:
-        build: (dtype, device, whether by Warp) -> function of the inputs.
+        build: (dtype, device, warp) -> function of the inputs.
         inputs: float64 on the CPU.
         bounds: largest error in float32 and float64.
         relative: to the largest entry of each output rather than absolute (metres, entries of rotations).
@@ -45,7 +45,7 @@ class Twin:
     """
 
     name: str
-    build: Callable[[torch.dtype, torch.device, bool], Function]
+    build: Callable[..., Function]
     inputs: Values
     bounds: tuple[float, float] = (1e-5, 1e-10)
     relative: bool = False
@@ -67,11 +67,11 @@ def compared(twin: Twin, dtype: torch.dtype, device: torch.device) -> dict:
     which = DTYPES.index(dtype)
     rounded = [part.to(dtype) for part in twin.inputs]  # rounding of the inputs is nobody's error
     begin = time.perf_counter()
-    found = _values(twin.build(dtype, device, True), [part.to(device) for part in rounded], twin)
+    found = _values(twin.build(dtype, device, warp=True), [part.to(device) for part in rounded], twin)
     if device.type == "cuda":
         torch.cuda.synchronize()
     first = time.perf_counter() - begin
-    expected = _values(twin.build(torch.float64, CPU, False), [part.double() for part in rounded], twin)
+    expected = _values(twin.build(torch.float64, CPU, warp=False), [part.double() for part in rounded], twin)
     row = {"dtype": str(dtype)[6:], "first_s": round(first, 2), "bound": twin.bounds[which]}
     row["error"] = max(map(functools.partial(_error, relative=twin.relative), found[0], expected[0]))
     row["ok"] = row["error"] <= row["bound"]
@@ -111,13 +111,14 @@ def kernels(bench: Bench) -> None:
     from gpu_solver import solver_twins
 
     count = 3 if bench.quick else 40
-    for make in (forward_twins, fit_twins, solver_twins):
-        for twin in make("low" if bench.quick else "mid", count):
-            for dtype in DTYPES:
-                if twin.double_only and dtype == torch.float32:
-                    continue
-                bench.row(f"{twin.name} {str(dtype)[6:]}", functools.partial(
-                    compared, twin, dtype, bench.device))  # fmt: skip
+    lod = "low" if bench.quick else "mid"
+    twins = [twin for make in (forward_twins, fit_twins, solver_twins) for twin in make(lod, count)]
+    for dtype in DTYPES:
+        for twin in twins:
+            if twin.double_only and dtype == torch.float32:
+                continue
+            call = functools.partial(compared, twin, dtype, bench.device)
+            bench.row(f"{twin.name} {str(dtype)[6:]}", call)
 
 
 def forward_twins(lod: str, count: int) -> Iterator[Twin]:
@@ -129,14 +130,14 @@ def forward_twins(lod: str, count: int) -> Iterator[Twin]:
     bind[:, 1:, :3, :3] = turns_of(count, joints - 1, 0.1, 2) @ bind[:, 1:, :3, :3]
     turns = turns_of(count, joints - 1, 0.5, 3)
 
-    def walk(dtype: torch.dtype, device: torch.device, warp: bool) -> Function:
+    def walk(dtype: torch.dtype, device: torch.device, *, warp: bool) -> Function:
         run = Kinematics(rig, dtype=dtype, device=device, warp=warp)
         return lambda bind, turns, shift: tuple(run(turns, run.local_offsets(bind), shift))
 
     yield Twin(name="kinematics", build=walk, inputs=(bind, turns, randn(count, 3, seed=4)),
                slopes=(1e-4, 1e-8))  # fmt: skip
 
-    def skinning(dtype: torch.dtype, device: torch.device, warp: bool) -> Function:
+    def skinning(dtype: torch.dtype, device: torch.device, *, warp: bool) -> Function:
         run = Skinning(rig.weights, dtype=dtype, device=device)
         if not warp:
             return lambda rest, moves: (run(rest.permute(2, 1, 0), moves, rows=True),)
@@ -153,18 +154,18 @@ def forward_twins(lod: str, count: int) -> Iterator[Twin]:
     flat = rest.permute(1, 2, 0).reshape(mesh.vertex_count, -1)
     moments = fit.moments(flat).view(joints, 4, 3, few).permute(3, 0, 1, 2)
 
-    def rotations(dtype: torch.dtype, device: torch.device, warp: bool) -> Function:
+    def rotations(dtype: torch.dtype, device: torch.device, *, warp: bool) -> Function:
         run = RotationFit(rig, dtype=dtype, device=device, warp=warp)
         return lambda places, covariances: (run(places, covariances),)
 
     given = moments[:, :, 0].contiguous(), moments[:, :, 1:].mT.contiguous()
-    # Finger covariances lose digits in float32 before the kernel sees them twice: against float64, not a twin.
+    # Covariances of fingers are known to few digits in float32; this is no comparison of twins.
     yield Twin(name="skeleton_fit", build=rotations, inputs=given, bounds=(2e-4, 1e-10), slopes=(5e-3, 1e-7))
     yield from _matrix_twins()
 
 
 def _matrix_twins() -> Iterator[Twin]:
-    def nearest(dtype: torch.dtype, device: torch.device, warp: bool) -> Function:  # noqa: ARG001
+    def nearest(dtype: torch.dtype, device: torch.device, *, warp: bool) -> Function:  # noqa: ARG001
         if not warp:
             return lambda given: (rotation_from_covariance(given),)
         from soma_core.kernels.nearest_rotation_wp import nearest_rotation
@@ -177,7 +178,7 @@ def _matrix_twins() -> Iterator[Twin]:
     yield Twin(name="nearest_rotation", build=nearest, inputs=(left @ stretch @ right.mT,),
                bounds=(2e-5, 1e-10))  # fmt: skip
 
-    def frames(dtype: torch.dtype, device: torch.device, warp: bool) -> Function:  # noqa: ARG001
+    def frames(dtype: torch.dtype, device: torch.device, *, warp: bool) -> Function:  # noqa: ARG001
         crow, col = torch.arange(0, 3 * 200 + 1, 3), torch.arange(600) % 7
 
         def run(moves: Tensor, moments: Tensor, centre: Tensor) -> Values:
@@ -211,8 +212,8 @@ def fit_twins(lod: str, count: int) -> Iterator[Twin]:
     weights = (0.5 + randn(few, mesh.vertex_count, seed=3).abs()) * fitted
     seen = rest @ turns_of(few, 1, 0.3, 4)[:, 0].mT[:, :, :] + randn(few, 1, 3, seed=5)
 
-    def moments(each: bool) -> Callable[[torch.dtype, torch.device, bool], Function]:
-        def build(dtype: torch.dtype, device: torch.device, warp: bool) -> Function:
+    def moments(*, each: bool) -> Callable[..., Function]:
+        def build(dtype: torch.dtype, device: torch.device, *, warp: bool) -> Function:
             run = SkinMoments(structure, rig, dtype=dtype, device=device, warp=warp)
             offsets = Kinematics(rig, dtype=dtype, device=device).local_offsets
 
@@ -229,11 +230,11 @@ def fit_twins(lod: str, count: int) -> Iterator[Twin]:
         return build
 
     bounds = {"bounds": (3e-5, 1e-9), "relative": True}
-    yield Twin(name="rest and skin moments", build=moments(False),
+    yield Twin(name="rest and skin moments", build=moments(each=False),
                inputs=(seen, rest[:1], bind[:1], weights[:1]), **bounds)  # fmt: skip
-    yield Twin(name="frame moments", build=moments(True), inputs=(seen, rest, bind, weights), **bounds)
+    yield Twin(name="frame moments", build=moments(each=True), inputs=(seen, rest, bind, weights), **bounds)
 
-    def residual(dtype: torch.dtype, device: torch.device, warp: bool) -> Function:
+    def residual(dtype: torch.dtype, device: torch.device, *, warp: bool) -> Function:
         skin = Skinning(rig.weights, dtype=dtype, device=device).weights
         run = ModelResidual(skin.csr, None, warp=warp, dtype=dtype, device=device)
 

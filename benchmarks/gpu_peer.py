@@ -42,8 +42,8 @@ def peer(bench: Bench) -> None:
                 bench.row(f"{mode} {case} {batch}",
                           functools.partial(_forward_row, bench, assets, mode, case, batch))  # fmt: skip
     for batch in (2,) if bench.quick else (8, 128, 1024):
-        bench.row(f"warp forward + backward {batch}",
-                  functools.partial(_forward_row, bench, assets, "warp", "forward_backward", batch))  # fmt: skip
+        call = functools.partial(_forward_row, bench, assets, "warp", "forward_backward", batch)
+        bench.row(f"warp forward + backward {batch}", call)
     for lod in ("low",) if bench.quick else ("mid", "low"):
         for method in ("analytical",) if bench.quick else ("analytical", "autograd", "analytical_autograd"):
             bench.row(f"inversion {method} {lod}",
@@ -114,14 +114,14 @@ def _forward_row(bench: Bench, assets: Path, mode: str, case: str, batch: int) -
     call = _call(bench, assets, mode, case, sets)
     ours = layer_of("soma", "plain", str(bench.device))
     params, poses, shift = sets[0]
-    shape = params["shape"].detach()[:1 if case == "pose" else 8]
+    shape = params["shape"].detach()[: 1 if case == "pose" else 8]
     with torch.no_grad():
         mine = ours({"shape": shape}, poses.detach()[:8], shift.detach()[:8]).vertices
     off = (call(0)[:8].detach() - mine).norm(dim=-1)
     row = {"batch": batch, "mean_mm_to_ours": 1e3 * float(off.mean())}
     if not row["mean_mm_to_ours"] < SAME_MM:
         raise ValueError(f"{row['mean_mm_to_ours']:.1f} mm from ours: not the same work, not timed")
-    found = bench.timed(call, sets=count, seconds=0.4)
+    found = bench.timed(call, sets=count)
     return row | found | {"meshes_per_s": batch / (1e-3 * found["ms"]), **bench.peak(call)}
 
 
@@ -145,12 +145,11 @@ def _inversion_row(bench: Bench, assets: Path, method: str, lod: str) -> dict:
     seen = target[:, low].contiguous() if lod == "low" else target
     run = PoseInversion(layer, low_lod=lod == "low")
     run.prepare_identity(given, None, repose_to_bind_pose=True)
-    result = run.fit(seen, **INVERSIONS[method])
+    memory, result = bench.peaked(lambda _: run.fit(seen, **INVERSIONS[method]))
     with torch.no_grad():
         rotations, hips = result["rotations"].detach(), result["root_translation"].detach()
         again = posed(rotations[:, 1:], hips, pose2rot=False, absolute_pose=True)
         error = 1e3 * (again - target).norm(dim=-1)
-    row = {"frames": count, "mean_mm": float(error.mean()), "max_mm": far_mm(again, target)}
-    found = bench.timed(lambda _: run.fit(seen, **INVERSIONS[method]), seconds=2.0, least=2, most=5)
-    row |= found | {"frames_per_s": count / (1e-3 * found["ms"])}
-    return row | bench.peak(lambda _: run.fit(seen, **INVERSIONS[method]))
+    row = {"frames": count, **memory, "mean_mm": float(error.mean()), "max_mm": far_mm(again, target)}
+    found = bench.timed(lambda _: run.fit(seen, **INVERSIONS[method]), seconds=1.5, most=5, warm=False)
+    return row | found | {"frames_per_s": count / (1e-3 * found["ms"])}

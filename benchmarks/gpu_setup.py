@@ -32,7 +32,7 @@ def backends() -> list[str]:
     return found
 
 
-@functools.lru_cache(maxsize=8)
+@functools.lru_cache(maxsize=16)
 def layer_of(
     backend: str, kind: str, device: str, dtype: torch.dtype = torch.float32, lod: str = "mid"
 ) -> SomaLayer:
@@ -70,11 +70,12 @@ def motion(count: int) -> tuple[Tensor, Tensor]:
         arrays = own_motion(count, SEED)
         return torch.from_numpy(arrays["poses"]), torch.from_numpy(arrays["translation"])
     spread = joint_spread(load_canonical("mid")[1].user_joint_names)
-    clips = [smooth_axis_angles(spread, 512, np.random.default_rng([SEED, 2, n])) for n in range(count // 512)]
+    seeds = [np.random.default_rng([SEED, 2, number]) for number in range(count // 512)]
+    clips = [smooth_axis_angles(spread, 512, random) for random in seeds]
     drift = 0.01 * np.random.default_rng([SEED, 3]).standard_normal((count, 3)).cumsum(0)
     return (
         torch.from_numpy(np.concatenate(clips)).float(),
-        torch.from_numpy(drift + [0.1, 0.95, 0.0]).float(),
+        torch.from_numpy(drift + np.array([0.1, 0.95, 0.0])).float(),
     )
 
 

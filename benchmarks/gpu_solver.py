@@ -30,7 +30,7 @@ LEFT_OUT = 0.03
 
 
 @functools.cache
-def _model(kind: str, dtype: torch.dtype, device: torch.device, warp: bool) -> tuple[SomaLayer, PoseModel]:
+def _model(kind: str, dtype: torch.dtype, device: torch.device, *, warp: bool) -> tuple[SomaLayer, PoseModel]:
     kernels = "auto" if warp else "torch"
     layer = SomaLayer("soma", lod="low", dtype=dtype, device=device, kernels=kernels, **KINDS[kind])
     return layer, PoseModel(layer, plain=kind == "plain", warp=warp)
@@ -44,7 +44,7 @@ def solver_twins(_lod: str, count: int) -> Iterator[Twin]:
     away = turns_of(count, joints, 0.05, 2) @ near
     hips = 0.3 * randn(count, 3, seed=3)
     for kind in KINDS:
-        layer, _ = _model(kind, torch.float64, torch.device("cpu"), False)
+        layer, _ = _model(kind, torch.float64, torch.device("cpu"), warp=False)
         identity = layer.identity({"shape": randn(1, 16, seed=4)})
         seen = layer.pose(identity, near, hips).vertices
         seen = seen + 0.005 * randn(*seen.shape, seed=5)
@@ -61,8 +61,8 @@ def solver_twins(_lod: str, count: int) -> Iterator[Twin]:
             )  # fmt: skip
 
 
-def _build(kind: str, what: str, dtype: torch.dtype, device: torch.device, warp: bool):
-    layer, model = _model(kind, dtype, device, warp)
+def _build(kind: str, what: str, dtype: torch.dtype, device: torch.device, *, warp: bool):
+    layer, model = _model(kind, dtype, device, warp=warp)
 
     def run(seen: Tensor, turns: Tensor, hips: Tensor) -> Values:
         identity = layer.identity({"shape": randn(1, 16, seed=4).to(dtype)})
