@@ -1,7 +1,5 @@
 """The forward pose in two kernels against the layer that it stands in for, and what it reads on the way."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 import scipy.sparse
@@ -16,7 +14,7 @@ from soma_core.layer import SomaLayer
 from soma_core.rig import load_canonical
 from tests.animation.test_twist import ALIGNED, EULER, SWING, with_modes
 from tests.bodies import CPU, randn
-from tests.kernels.parity import DEVICES, DTYPES, VALUES_M
+from tests.kernels.parity import DEVICES, DTYPES, GRADIENTS, VALUES_M
 
 PARTS = ("vertices", "joints", "transforms")
 
@@ -58,7 +56,9 @@ def layer(request):
 
 @pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("absolute", [False, True])
-@pytest.mark.parametrize(("batch", "own", "scaled"), [(1, 0, 1), (3, 0, 0), (9, 0, 1), (21, 1, 0), (21, 1, 1)])
+@pytest.mark.parametrize(
+    ("batch", "own", "scaled"), [(1, 0, 1), (3, 0, 0), (9, 0, 1), (21, 1, 0), (21, 1, 1)]
+)
 @torch.no_grad()
 def test_equals_the_layer(layer, batch, own, scaled, absolute, device):
     twin = fast_twin(layer, device)
@@ -142,7 +142,8 @@ def test_gradients_take_the_other_way(layer):
         asking = rotations.clone().requires_grad_()
         vertices = one.pose(one.identity(shapes(layer, 1)), asking, translation).vertices
         grads.append(torch.autograd.grad(vertices.square().sum(), asking)[0])
-    torch.testing.assert_close(*grads)
+    bound = GRADIENTS[layer.dtype] * float(grads[0].abs().max())
+    torch.testing.assert_close(*grads, atol=bound, rtol=0)
     turned = torch.func.vmap(lambda r: twin.pose_plain(twin.identity(), r[None]).vertices)(rotations)
     assert turned.shape[0] == 2
 
@@ -185,7 +186,8 @@ def test_a_layer_without_room_poses_as_before(layer, monkeypatch):
     assert twin.fused is None
     rotations, translation = poses(layer, 2)
     assert_same(
-        twin.pose(twin.identity(), rotations, translation), layer.pose(layer.identity(), rotations, translation)
+        twin.pose(twin.identity(), rotations, translation),
+        layer.pose(layer.identity(), rotations, translation),
     )
 
 
@@ -197,36 +199,35 @@ class Watch(torch.utils._python_dispatch.TorchDispatchMode):
         self.seen = []
 
     def __torch_dispatch__(self, function, types, args=(), kwargs=None):
-        name = function.name()
         out = function(*args, **(kwargs or {}))
-        devices = {part.device.type for part in (*args, out) if isinstance(part, torch.Tensor)}
-        tensors = [part for part in args if isinstance(part, torch.Tensor)]
-        if len(devices) > 1 or any(word in name for word in ("nonzero", "_local_scalar", "item", "equal")):
-            self.seen.append(name)
-        elif any(part.device.type == "cpu" for part in tensors):
-            self.seen.append(name)
+        parts = torch.utils._pytree.tree_leaves((args, kwargs, out))
+        if not all(part.is_meta for part in parts if isinstance(part, torch.Tensor)):
+            self.seen.append(function.name())
         return out
 
 
-def test_nothing_is_read_from_the_host():
-    """Shapes alone, on a device that is not there: every value that is asked for raises or is noted."""
-    from torch._subclasses.fake_tensor import FakeTensorMode
+def test_nothing_is_read_from_the_host(monkeypatch):
+    """On a device of shapes alone every value that is asked for raises, and what passes the host is noted.
 
+    Fake CUDA tensors would say more, but a build of torch without CUDA refuses to take slices of them.
+    """
+    monkeypatch.setattr(torch, "is_autocast_enabled", lambda _kind: False)  # it knows no such device
     layer = SomaLayer("soma", lod="low")
     layer.fuse()
-    with FakeTensorMode(allow_non_fake_inputs=False) as mode, torch.no_grad():
-        for module in layer.modules():
-            for name, buffer in list(module._buffers.items()):
-                module._buffers[name] = mode.from_tensor(buffer).to("cuda")
-        layer.device = torch.device("cuda")
-        rotations = torch.empty(3, 77, 3, device="cuda")
-        shape = torch.empty(3, 128, device="cuda")
-        with Watch() as watch:
-            posed = layer({"shape": shape}, rotations, torch.empty(3, 3, device="cuda"))
-            again = layer.pose(layer.identity({"shape": shape[:1]}), rotations)
-    assert posed.vertices.device.type == again.vertices.device.type == "cuda"
+    for module in layer.modules():
+        for name, buffer in list(module._buffers.items()):
+            module._buffers[name] = torch.empty_like(buffer, device="meta")
+    layer.device = torch.device("meta")
+    rotations, shape = torch.empty(3, 77, 3, device="meta"), torch.empty(3, 128, device="meta")
+    with torch.no_grad(), Watch() as watch:
+        posed = layer({"shape": shape}, rotations, torch.empty(3, 3, device="meta"))
+        again = layer.pose(layer.identity({"shape": shape[:1]}), rotations, absolute=True)
+    assert posed.vertices.is_meta
     assert posed.vertices.shape == again.vertices.shape == (3, layer.mesh.vertex_count, 3)
     assert watch.seen == []
+    with Watch() as watch:
+        _ = rotations[:, [1, 2]]
+    assert watch.seen != []
 
 
 def test_operators_are_registered_soundly(layer):
@@ -248,4 +249,3 @@ def test_the_tables_keep_the_weights(layer):
     numbers = float(fused.patches.reals.sum())
     second, weights = layer.correctives.second.scipy(), layer.posing.posed_skinning.weights.scipy()
     assert numbers == pytest.approx(second.sum() + weights.sum(), abs=1e-6)
-    assert replace(layer.identity(), params={}).batch_size == 1
