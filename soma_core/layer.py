@@ -25,6 +25,7 @@ from soma_core.animation.kinematics import relative_from_absolute
 from soma_core.animation.posed import Posed
 from soma_core.backends.parameters import batch_parameters
 from soma_core.backends.rest_shape import make_rest_shape
+from soma_core.compiled import CompiledLayer
 from soma_core.correctives.model import find_correctives, load_correctives
 from soma_core.errors import InputError
 from soma_core.geometry.rotations import axis_angle_to_matrix
@@ -237,6 +238,20 @@ class SomaLayer(Derived):
         moves = self._offsets(body.identity, body.relative, absolute=absolute)
         return self.posing.pose(*body[:3], absolute=absolute, bone_scale=body.bone_scale, offsets=moves)
 
+    def compiled(
+        self,
+        *,
+        batch: int,
+        identities: int = 1,
+        params: bool = False,
+        absolute: bool = False,
+        matrices: bool = False,
+    ) -> CompiledLayer:
+        """:meth:`pose` of `batch` bodies, or with `params` the layer, as one CUDA graph; see its class."""
+        return CompiledLayer(
+            self, batch=batch, identities=identities, params=params, absolute=absolute, matrices=matrices
+        )
+
     @own_precision
     def pose_plain(
         self,
@@ -289,7 +304,7 @@ class SomaLayer(Derived):
     def _body(
         self, identity: Identity, rotations: Tensor, translation: Tensor | None, bone_scale: Tensor | None
     ) -> Body:
-        """The arguments of `pose`, checked and brought to one batch size; matrices, if not :meth:`_fusible`."""
+        """The arguments of `pose`, checked, of one batch size; as matrices if not :meth:`_fusible`."""
         relative = check_rotations(
             rotations, len(self.joint_names), self.dtype, self.device, validate=self.validate, convert=False
         )

@@ -40,6 +40,7 @@ RANKS = [
     {"kernels", "_inputs", "_derived"},
     {"rig", "topology", "skeleton", "animation", "correctives"},
     {"backends", "io"},
+    {"compiled"},
     {"layer"},
     {"inversion"},
     {"native", "registration"},

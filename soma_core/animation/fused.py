@@ -87,7 +87,7 @@ class FusedPose(torch.nn.Module):
 def _body_tables(
     posing: Animation, twist: Twist | None, correctives: Correctives | None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """All constants of the first kernel: integers behind a header that says where each begins, and numbers."""
+    """Constants of the first kernel: integers, behind a header that says where each begins; numbers."""
     kinematics = posing.kinematics
     tables = dict.fromkeys((*BODY_INTS, *BODY_REALS), np.zeros(0))
     sizes = kinematics.level_sizes

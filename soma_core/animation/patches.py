@@ -7,6 +7,7 @@ rows side by side, padded to the longest: what 32 threads read together lies tog
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 
 import numpy as np
@@ -120,7 +121,7 @@ def _tables(
     lengths = np.diff(moves[0]) * PATCH_JOINTS + np.diff(blends[0])  # moves first: they are longer
     used: list[list[np.ndarray]] = [[], []]
     local = [np.empty_like(blends[1]), np.empty_like(moves[1])]
-    for patch, (first, end) in enumerate(zip(bounds[:-1], bounds[1:], strict=True)):
+    for patch, (first, end) in enumerate(itertools.pairwise(bounds)):
         slots[patch, : end - first] = np.argsort(-lengths[first:end], kind="stable")
         for kind, (starts, ids, _) in enumerate((blends, moves)):
             part = slice(starts[first], starts[end])

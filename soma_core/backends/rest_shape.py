@@ -106,7 +106,7 @@ class ComposedRestShape(torch.nn.Module):
         """Vertices as planes (3, v, B) [m] and fitted transforms (B, J, 4, 4) [m]."""
         coefficients = self.coefficients(params)
         rows = coefficients
-        if rows.is_cuda:  # a body's numbers lie together, as the kernels that follow read them
+        if rows.device.type != "cpu":  # a body's numbers lie together, as the kernels that follow read them
             stacked = torch.addmm(self.template.T, rows, self.basis.T).T
         else:
             if len(rows) == 1:  # MKL multiplies by two columns three times faster than by one

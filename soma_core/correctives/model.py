@@ -59,7 +59,7 @@ class Correctives(torch.nn.Module):
         self.first = SparseRows(weights.first.T.tocsr()[used], dtype=dtype, device=device)
         self.second = SparseRows(second[:, used].tocsr(), dtype=dtype, device=device)
         self.owner = used // weights.channels
-        # A tensor: a list would be copied to a GPU at each call, and torch.compile does not know NumPy's values.
+        # A tensor: a list is copied to a GPU at each call, and torch.compile knows no values of NumPy's.
         above = torch.as_tensor(rig.parents[2:].astype(np.int64), device=device)
         self.register_buffer("above", above, persistent=False)
         self.length = float(skeleton_length(torch.as_tensor(rig.bind_world.copy())[None], rig))

@@ -1,4 +1,4 @@
-"""The small steps of an identity in Warp, without derivatives: fitted skeletons, and the way to the bind pose.
+"""The small steps of an identity in Warp, without derivatives: fitted skeleton, way to the bind pose.
 
 On CUDA, dozens of products of 3x3 matrices would each be a launch of their own.
 """
@@ -151,7 +151,7 @@ def fitted_world(displacement: Tensor, source: Tensor, bind_rotation: Tensor, jo
 def to_bind_pose(
     fitted: Tensor, parents: Tensor, bind_rotation: Tensor, parent_orient: Tensor, bind_parent_turn: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """World transforms (B, J, 4, 4) in the bind pose, and the skinning transforms (B, J, 3, 4) that lead there.
+    """World transforms in the bind pose (B, J, 4, 4), and the skinning transforms (B, J, 3, 4) to it.
 
     Args:
         fitted: (B, J, 4, 4) [m].

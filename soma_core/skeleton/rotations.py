@@ -118,7 +118,7 @@ class RotationFit(torch.nn.Module):
         return 1.5 * world - 0.5 * world @ (world.transpose(-1, -2) @ world)  # undo the products' rounding
 
     def world(self, joints: Tensor, covariances: Tensor) -> Tensor:
-        """World transforms (B, J, 4, 4) [m] by kernels alone; takes what :meth:`forward` does. No derivative."""
+        """World transforms (B, J, 4, 4) [m] by kernels alone; takes what :meth:`forward` does."""
         from soma_core.kernels.identity_wp import fitted_world
         from soma_core.kernels.skeleton_fit_wp import fit_displacements
 

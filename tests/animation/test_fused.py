@@ -1,0 +1,251 @@
+"""The forward pose in two kernels against the layer that it stands in for, and what it reads on the way."""
+
+import numpy as np
+import pytest
+import scipy.sparse
+import torch
+
+from soma_core.animation import fused as fused_module
+from soma_core.animation.engine import ProceduralAnimation
+from soma_core.animation.fused import FusedPose
+from soma_core.animation.patches import Patches, side_by_side
+from soma_core.animation.posed import Posed
+from soma_core.layer import SomaLayer
+from soma_core.rig import load_canonical
+from tests.animation.test_twist import ALIGNED, EULER, SWING, with_modes
+from tests.bodies import CPU, randn
+from tests.kernels.parity import DEVICES, DTYPES, GRADIENTS, VALUES_M
+
+PARTS = ("vertices", "joints", "transforms")
+
+
+def assert_same(got: Posed, expected: Posed):
+    for name in PARTS:
+        one, other = getattr(got, name), getattr(expected, name)
+        assert one.dtype == other.dtype
+        torch.testing.assert_close(one.cpu(), other.cpu(), atol=VALUES_M[one.dtype], rtol=0)
+
+
+def poses(layer, batch, seed=0):
+    kind = {"dtype": layer.dtype}
+    rotations = 0.7 * randn(batch, 77, 3, seed=seed, **kind)
+    return rotations.to(layer.device), randn(batch, 3, seed=seed + 1, **kind).to(layer.device)
+
+
+def shapes(layer, count, seed=5):
+    return {"shape": randn(count, 128, seed=seed, dtype=layer.dtype).to(layer.device)}
+
+
+def fast_twin(layer, device=CPU, **options):
+    """The same layer with kernels for what needs no gradient, on the CPU as well."""
+    lod = layer.mesh.lod
+    twin = SomaLayer(layer.backend, lod=lod, dtype=layer.dtype, device=device, **options)
+    twin.fuse()
+    assert twin.fused is not None
+    return twin
+
+
+def moved(parts, device):
+    return [None if part is None else part.to(device) for part in parts]
+
+
+@pytest.fixture(scope="module", params=DTYPES, ids=str)
+def layer(request):
+    return SomaLayer("soma", lod="low", dtype=request.param)
+
+
+@pytest.mark.parametrize("device", DEVICES)
+@pytest.mark.parametrize("absolute", [False, True])
+@pytest.mark.parametrize(
+    ("batch", "own", "scaled"), [(1, 0, 1), (3, 0, 0), (9, 0, 1), (21, 1, 0), (21, 1, 1)]
+)
+@torch.no_grad()
+def test_equals_the_layer(layer, batch, own, scaled, absolute, device):
+    twin = fast_twin(layer, device)
+    rotations, translation = poses(layer, batch)
+    scale = 0.8 + 0.4 * torch.rand(batch, 77, dtype=layer.dtype) if scaled else None
+    params = shapes(layer, batch if own else 1)
+    expected = layer.pose(layer.identity(params), rotations, translation, absolute=absolute, bone_scale=scale)
+    there, rotations, translation, scale = moved((params["shape"], rotations, translation, scale), device)
+    identity = twin.identity({"shape": there})
+    assert_same(twin.pose(identity, rotations, translation, absolute=absolute, bone_scale=scale), expected)
+    got = twin({"shape": there}, rotations, translation, absolute=absolute, bone_scale=scale)
+    assert_same(got, expected)
+
+
+@pytest.mark.parametrize("device", DEVICES)
+@pytest.mark.parametrize(
+    "options",
+    [{"correctives": None}, {"procedural": False}, {"repose": False}, {"exact": True}],
+    ids=str,
+)
+@torch.no_grad()
+def test_equals_other_layers(options, device):
+    plain = SomaLayer("soma", lod="low", **options)
+    twin = fast_twin(plain, device, **options)
+    rotations, translation = poses(plain, 11)
+    shape = shapes(plain, 11)["shape"]
+    got = twin({"shape": shape.to(device)}, rotations.to(device), translation.to(device))
+    assert_same(got, plain({"shape": shape}, rotations, translation))
+
+
+@pytest.mark.parametrize("lod", ["mid", "xlo"])
+@torch.no_grad()
+def test_equals_at_every_lod(lod):
+    plain = SomaLayer("soma", lod=lod)
+    twin = fast_twin(plain)
+    rotations, translation = poses(plain, 10)
+    assert_same(
+        twin(shapes(plain, 10), rotations, translation), plain(shapes(plain, 10), rotations, translation)
+    )
+
+
+@torch.no_grad()
+def test_matrices_shared_poses_and_turns_of_any_size(layer):
+    twin = fast_twin(layer)
+    identity = layer.identity(shapes(layer, 4))
+    for size in (0.0, 1e-5, 3.1, 6.0):
+        rotations = size * torch.nn.functional.normalize(randn(1, 77, 3, dtype=layer.dtype), dim=-1)
+        expected = layer.pose(identity, rotations)
+        assert_same(twin.pose(identity, rotations), expected)
+        matrices = torch.linalg.matrix_exp(_skewed(rotations))
+        assert_same(twin.pose(identity, matrices), layer.pose(identity, matrices))
+
+
+def _skewed(vectors):
+    x, y, z = vectors.unbind(-1)
+    zero = torch.zeros_like(x)
+    return torch.stack((zero, -z, y, z, zero, -x, -y, x, zero), -1).unflatten(-1, (3, 3))
+
+
+@pytest.mark.parametrize("modes", [SWING, EULER, lambda index: (ALIGNED, SWING, EULER)[index % 3]])
+@torch.no_grad()
+def test_every_twist_mode(modes):
+    rig = with_modes(load_canonical("low")[1], modes)
+    kind = {"dtype": torch.float64, "device": CPU}
+    posing = ProceduralAnimation(rig, kernels="torch", **kind)
+    layer = SomaLayer("soma", lod="low", dtype=torch.float64, correctives=None)
+    identity = layer.identity(shapes(layer, 1))
+    rotations, translation = poses(layer, 5)
+    matrices = torch.linalg.matrix_exp(_skewed(rotations))
+    expected = posing.pose(identity, matrices, translation, absolute=False)
+    fused = FusedPose(posing, None, **kind)
+    assert_same(fused(identity, matrices, translation, absolute=False), expected)
+
+
+def test_gradients_take_the_other_way(layer):
+    twin = fast_twin(layer)
+    twin.fused.forward = None  # would not be callable
+    rotations, translation = poses(layer, 2)
+    grads = []
+    for one in (layer, twin):
+        asking = rotations.clone().requires_grad_()
+        vertices = one.pose(one.identity(shapes(layer, 1)), asking, translation).vertices
+        grads.append(torch.autograd.grad(vertices.square().sum(), asking)[0])
+    bound = GRADIENTS[layer.dtype] * float(grads[0].abs().max())
+    torch.testing.assert_close(*grads, atol=bound, rtol=0)
+    turned = torch.func.vmap(lambda r: twin.pose_plain(twin.identity(), r[None]).vertices)(rotations)
+    assert turned.shape[0] == 2
+
+
+@torch.no_grad()
+def test_empty_batch_and_plain_pose(layer):
+    twin = fast_twin(layer)
+    rotations, translation = poses(layer, 3)
+    identity = layer.identity()
+    assert twin.pose(identity, rotations[:0]).vertices.shape == (0, layer.mesh.vertex_count, 3)
+    assert_same(
+        twin.pose_plain(identity, rotations, translation), layer.pose_plain(identity, rotations, translation)
+    )
+
+
+def test_rows_side_by_side():
+    matrix = scipy.sparse.random_array((64, 20), density=0.2, rng=np.random.default_rng(0)).tocsr()
+    rows = np.random.default_rng(1).permutation(64)
+    rows[5] = -1
+    start, ids, values = side_by_side(matrix.indptr.astype(np.int64), matrix.indices, matrix.data, rows)
+    dense = matrix.toarray()
+    for place, row in enumerate(rows):
+        part = slice(start[place // 32] + place % 32, start[place // 32 + 1], 32)
+        found = np.bincount(ids[part], values[part], minlength=20)
+        np.testing.assert_array_equal(found, dense[row] if row >= 0 else 0)
+
+
+def test_patches_are_cut_smaller_where_they_hold_too_much():
+    crowded = scipy.sparse.csr_array(np.kron(np.eye(20), np.ones((16, 8))))
+    patches = Patches(crowded, None, dtype=torch.float64, device=CPU)
+    assert patches.fits
+    assert patches.count > 3
+    assert not Patches(scipy.sparse.csr_array(np.ones((3, 100))), None, dtype=torch.float64, device=CPU).fits
+
+
+def test_a_layer_without_room_poses_as_before(layer, monkeypatch):
+    monkeypatch.setattr(fused_module, "JOINT_LIMIT", 10)
+    twin = SomaLayer("soma", lod="low", dtype=layer.dtype)
+    twin.fuse()
+    assert twin.fused is None
+    rotations, translation = poses(layer, 2)
+    assert_same(
+        twin.pose(twin.identity(), rotations, translation),
+        layer.pose(layer.identity(), rotations, translation),
+    )
+
+
+class Watch(torch.utils._python_dispatch.TorchDispatchMode):
+    """Notes each operator that brings numbers from the device to the host or the other way."""
+
+    def __init__(self):
+        super().__init__()
+        self.seen = []
+
+    def __torch_dispatch__(self, function, types, args=(), kwargs=None):
+        out = function(*args, **(kwargs or {}))
+        parts = torch.utils._pytree.tree_leaves((args, kwargs, out))
+        if not all(part.is_meta for part in parts if isinstance(part, torch.Tensor)):
+            self.seen.append(function.name())
+        return out
+
+
+def test_nothing_is_read_from_the_host(monkeypatch):
+    """On a device of shapes alone every value that is asked for raises, and what passes the host is noted.
+
+    Fake CUDA tensors would say more, but a build of torch without CUDA refuses to take slices of them.
+    """
+    monkeypatch.setattr(torch, "is_autocast_enabled", lambda _kind: False)  # it knows no such device
+    layer = SomaLayer("soma", lod="low")
+    layer.fuse()
+    for module in layer.modules():
+        for name, buffer in list(module._buffers.items()):
+            module._buffers[name] = torch.empty_like(buffer, device="meta")
+    layer.device = torch.device("meta")
+    rotations, shape = torch.empty(3, 77, 3, device="meta"), torch.empty(3, 128, device="meta")
+    with torch.no_grad(), Watch() as watch:
+        posed = layer({"shape": shape}, rotations, torch.empty(3, 3, device="meta"))
+        again = layer.pose(layer.identity({"shape": shape[:1]}), rotations, absolute=True)
+    assert posed.vertices.is_meta
+    assert posed.vertices.shape == again.vertices.shape == (3, layer.mesh.vertex_count, 3)
+    assert watch.seen == []
+    with Watch() as watch:
+        _ = rotations[:, [1, 2]]
+    assert watch.seen != []
+
+
+def test_operators_are_registered_soundly(layer):
+    twin = fast_twin(layer)
+    fused, identity = twin.fused, twin.identity(shapes(layer, 2))
+    rotations, translation = poses(layer, 2)
+    given = (rotations, translation, identity.bind_world, None, fused.ints, fused.reals, 2)
+    given = (*given, fused.helper_count, fused.activation_count, False)
+    torch.library.opcheck(torch.ops.soma_core.pose_bodies.default, given)
+    _, _, skin, active = torch.ops.soma_core.pose_bodies(*given)
+    tables = fused.patches
+    given = (identity.rest, skin, active, tables.ints, tables.shorts, tables.reals, tables.count)
+    torch.library.opcheck(torch.ops.soma_core.skin_patches.default, given)
+
+
+def test_the_tables_keep_the_weights(layer):
+    """Every weight is there once: numbers of all patches add up to those of the matrices."""
+    fused = FusedPose(layer.posing, layer.correctives, dtype=torch.float64, device=CPU)
+    numbers = float(fused.patches.reals.sum())
+    second, weights = layer.correctives.second.scipy(), layer.posing.posed_skinning.weights.scipy()
+    assert numbers == pytest.approx(second.sum() + weights.sum(), abs=1e-6)
