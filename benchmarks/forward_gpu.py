@@ -77,30 +77,28 @@ def gradients(lod):
 def times(lod):
     layer = SomaLayer("soma", lod=lod, device="cuda")
     for batch in (1, 8, 64, 256, 1024):
-        rotations, translation, shape = inputs(batch, "cuda", torch.float32, batch)
         with torch.no_grad():
-            one, own = layer.identity({"shape": shape[:1]}), layer.identity({"shape": shape})
-            calls = {
-                "pose, one identity": lambda: layer.pose(one, rotations, translation),
-                "pose, own identities": lambda: layer.pose(own, rotations, translation),
-                "identity": lambda: layer.identity({"shape": shape}),
-                "forward": lambda: layer({"shape": shape}, rotations, translation),
-            }
-            graph = layer.compiled(batch=batch)
-            whole = layer.compiled(batch=batch, identities=batch, params=True)
-            calls["pose, graph"] = lambda: graph(one, rotations, translation)
-            calls["forward, graph"] = lambda: whole({"shape": shape}, rotations, translation)
-            calls["pose, graph replay alone"] = graph._graph.replay
-            for name, call in calls.items():
-                single, rows = milliseconds(call)
-                print(
-                    f"B={batch} {name}: {single:.3f} ms single, {rows:.3f} in a row, {batch / rows:,.0f} k/s"
-                )
-            error = (
-                graph(one, rotations, translation).vertices - layer.pose(one, rotations, translation).vertices
-            )
-            print(f"B={batch} graph and call differ by {float(error.abs().max()):.2e} m")
-            del graph, whole, calls
+            times_of(layer, batch, *inputs(batch, "cuda", torch.float32, batch))
+
+
+def times_of(layer, batch, rotations, translation, shape):
+    one, own = layer.identity({"shape": shape[:1]}), layer.identity({"shape": shape})
+    graph = layer.compiled(batch=batch)
+    whole = layer.compiled(batch=batch, identities=batch, params=True)
+    calls = {
+        "pose, one identity": lambda: layer.pose(one, rotations, translation),
+        "pose, own identities": lambda: layer.pose(own, rotations, translation),
+        "identity": lambda: layer.identity({"shape": shape}),
+        "forward": lambda: layer({"shape": shape}, rotations, translation),
+        "pose, graph": lambda: graph(one, rotations, translation),
+        "pose, graph replay alone": graph._graph.replay,
+        "forward, graph": lambda: whole({"shape": shape}, rotations, translation),
+    }
+    for name, call in calls.items():
+        single, rows = milliseconds(call)
+        print(f"B={batch} {name}: {single:.3f} ms single, {rows:.3f} in a row, {batch / rows:,.1f} k/s")
+    error = graph(one, rotations, translation).vertices - layer.pose(one, rotations, translation).vertices
+    print(f"B={batch} graph and call differ by {float(error.abs().max()):.2e} m")
 
 
 def kernels(lod):
