@@ -118,8 +118,13 @@ def kernels(lod):
 
 def synchronisations(lod):
     """Calls raise where the host would wait for the device."""
-    layer = SomaLayer("soma", lod=lod, device="cuda")
-    rotations, translation, shape = inputs(4, "cuda", torch.float32, 4)
+    for exact in (False, True):
+        layer = SomaLayer("soma", lod=lod, device="cuda", exact=exact)
+        synchronisations_of(layer, *inputs(4, "cuda", torch.float32, 4))
+        print(f"exact={exact}: the host waits nowhere")
+
+
+def synchronisations_of(layer, rotations, translation, shape):
     with torch.no_grad():
         layer({"shape": shape}, rotations, translation)
         torch.cuda.set_sync_debug_mode("error")
@@ -127,7 +132,6 @@ def synchronisations(lod):
             layer({"shape": shape}, rotations, translation)
         finally:
             torch.cuda.set_sync_debug_mode("default")
-    print("the host waits nowhere")
 
 
 if __name__ == "__main__":
