@@ -3,6 +3,7 @@
 ``python benchmarks/forward_gpu.py [lod]``
 """
 
+import functools
 import statistics
 import sys
 import traceback
@@ -101,6 +102,25 @@ def times_of(layer, batch, rotations, translation, shape):
     print(f"B={batch} graph and call differ by {float(error.abs().max()):.2e} m")
 
 
+def groups(lod):
+    """How many bodies should share one reading of the weights."""
+    from soma_core.kernels import fused_pose_wp
+
+    chosen = dict(fused_pose_wp._GROUP)
+    for size in (4, 8):
+        fused_pose_wp._GROUP["float32"] = size
+        fused_pose_wp._patch_kernel.cache_clear()
+        layer = SomaLayer("soma", lod=lod, device="cuda")
+        for batch in (64, 1024):
+            rotations, translation, shape = inputs(batch, "cuda", torch.float32, 1)
+            with torch.no_grad():
+                one = layer.identity({"shape": shape})
+                _, rows = milliseconds(functools.partial(layer.pose, one, rotations, translation))
+            print(f"groups of {size}: B={batch} pose {rows:.3f} ms in a row")
+    fused_pose_wp._GROUP.update(chosen)
+    fused_pose_wp._patch_kernel.cache_clear()
+
+
 def kernels(lod):
     from torch.profiler import ProfilerActivity, profile
 
@@ -144,6 +164,7 @@ if __name__ == "__main__":
         lambda: gradients(LOD),
         lambda: synchronisations(LOD),
         lambda: times(LOD),
+        lambda: groups(LOD),
         lambda: kernels(LOD),
     ):
         try:
