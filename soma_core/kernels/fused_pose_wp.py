@@ -12,7 +12,8 @@ import warp as wp
 from torch import Tensor
 
 from soma_core.kernels._native import native
-from soma_core.kernels._posing_text import body_text, patch_text
+from soma_core.kernels._patch_text import patch_text
+from soma_core.kernels._posing_text import body_text
 from soma_core.kernels._runtime import as_warp, launching, scalar_name
 
 __all__ = ["pose_bodies", "skin_patches"]
