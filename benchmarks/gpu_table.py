@@ -57,9 +57,25 @@ def _tables(state: dict) -> Iterator[Table]:
              _verdict(row)] for row in _rows(state, "kernels")]  # fmt: skip
     head = ["kernel", "error", "bound", "gradient", "bound", "first call, s", "ok"]
     yield "Kernels on the device against torch in float64 on the CPU", head, rows
-    keys = ("mm_to_float64", "mm_to_cpu", "slope_rotations", "slope_translation", "slope_params")
+    keys = (
+        "mm_to_float64",
+        "mm_without_gradients",
+        "mm_pose",
+        "slope_rotations",
+        "slope_translation",
+        "slope_params",
+    )
     rows = [[row["name"], *_cells(row, *keys), _verdict(row)] for row in _rows(state, "layer")]
-    head = ["layer", "mm to float64", "mm to the CPU", "rotations", "translation", "parameters", "ok"]
+    head = [
+        "layer",
+        "mm to float64",
+        "without gradients",
+        "pose",
+        "rotations",
+        "translation",
+        "parameters",
+        "ok",
+    ]
     yield "The layer on the device, and its gradients against float64 on the CPU", head, rows
     keys = ("mean_mm", "max_mm", "max_degrees", "converged")
     rows = [[row["name"], *_cells(row, *keys, "first_s"), _verdict(row)] for row in _rows(state, "fit")]
