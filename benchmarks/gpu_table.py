@@ -132,7 +132,12 @@ def _trouble(state: dict) -> list[str]:
     for name, section in state["sections"].items():
         lines.append(f"{name}: {section['status']}, {section['seconds']:.0f} s, "
                      f"{len(section['rows'])} rows. {section.get('why', '')[-200:]}".strip())  # fmt: skip
+        skipped = [row["name"] for row in section["rows"] if row["status"] == "skipped"]
+        if skipped:
+            lines.append(f"- no time for {len(skipped)} rows: {', '.join(skipped)}"[:400])
         for row in section["rows"]:
+            if row["status"] == "skipped":
+                continue
             if row["status"] != "done" or row.get("ok") is False or row["name"] == "none":
                 wrong = "" if row.get("ok") is not False else " WRONG"
                 lines.append(f"- {row['name']}: {row['status']}{wrong} {row.get('why', '')[:150]}".rstrip())
