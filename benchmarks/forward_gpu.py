@@ -3,6 +3,7 @@
 ``python benchmarks/forward_gpu.py [lod]``
 """
 
+import functools
 import statistics
 import sys
 import traceback
@@ -77,30 +78,47 @@ def gradients(lod):
 def times(lod):
     layer = SomaLayer("soma", lod=lod, device="cuda")
     for batch in (1, 8, 64, 256, 1024):
-        rotations, translation, shape = inputs(batch, "cuda", torch.float32, batch)
         with torch.no_grad():
-            one, own = layer.identity({"shape": shape[:1]}), layer.identity({"shape": shape})
-            calls = {
-                "pose, one identity": lambda: layer.pose(one, rotations, translation),
-                "pose, own identities": lambda: layer.pose(own, rotations, translation),
-                "identity": lambda: layer.identity({"shape": shape}),
-                "forward": lambda: layer({"shape": shape}, rotations, translation),
-            }
-            graph = layer.compiled(batch=batch)
-            whole = layer.compiled(batch=batch, identities=batch, params=True)
-            calls["pose, graph"] = lambda: graph(one, rotations, translation)
-            calls["forward, graph"] = lambda: whole({"shape": shape}, rotations, translation)
-            calls["pose, graph replay alone"] = graph._graph.replay
-            for name, call in calls.items():
-                single, rows = milliseconds(call)
-                print(
-                    f"B={batch} {name}: {single:.3f} ms single, {rows:.3f} in a row, {batch / rows:,.0f} k/s"
-                )
-            error = (
-                graph(one, rotations, translation).vertices - layer.pose(one, rotations, translation).vertices
-            )
-            print(f"B={batch} graph and call differ by {float(error.abs().max()):.2e} m")
-            del graph, whole, calls
+            times_of(layer, batch, *inputs(batch, "cuda", torch.float32, batch))
+
+
+def times_of(layer, batch, rotations, translation, shape):
+    one, own = layer.identity({"shape": shape[:1]}), layer.identity({"shape": shape})
+    graph = layer.compiled(batch=batch)
+    whole = layer.compiled(batch=batch, identities=batch, params=True)
+    calls = {
+        "pose, one identity": lambda: layer.pose(one, rotations, translation),
+        "pose, own identities": lambda: layer.pose(own, rotations, translation),
+        "identity": lambda: layer.identity({"shape": shape}),
+        "forward": lambda: layer({"shape": shape}, rotations, translation),
+        "pose, graph": lambda: graph(one, rotations, translation),
+        "pose, graph replay alone": graph._graph.replay,
+        "forward, graph": lambda: whole({"shape": shape}, rotations, translation),
+    }
+    for name, call in calls.items():
+        single, rows = milliseconds(call)
+        print(f"B={batch} {name}: {single:.3f} ms single, {rows:.3f} in a row, {batch / rows:,.1f} k/s")
+    error = graph(one, rotations, translation).vertices - layer.pose(one, rotations, translation).vertices
+    print(f"B={batch} graph and call differ by {float(error.abs().max()):.2e} m")
+
+
+def groups(lod):
+    """How many bodies should share one reading of the weights."""
+    from soma_core.kernels import fused_pose_wp
+
+    chosen = dict(fused_pose_wp._GROUP)
+    for size in (4, 8):
+        fused_pose_wp._GROUP["float32"] = size
+        fused_pose_wp._patch_kernel.cache_clear()
+        layer = SomaLayer("soma", lod=lod, device="cuda")
+        for batch in (64, 1024):
+            rotations, translation, shape = inputs(batch, "cuda", torch.float32, 1)
+            with torch.no_grad():
+                one = layer.identity({"shape": shape})
+                _, rows = milliseconds(functools.partial(layer.pose, one, rotations, translation))
+            print(f"groups of {size}: B={batch} pose {rows:.3f} ms in a row")
+    fused_pose_wp._GROUP.update(chosen)
+    fused_pose_wp._patch_kernel.cache_clear()
 
 
 def kernels(lod):
@@ -120,8 +138,13 @@ def kernels(lod):
 
 def synchronisations(lod):
     """Calls raise where the host would wait for the device."""
-    layer = SomaLayer("soma", lod=lod, device="cuda")
-    rotations, translation, shape = inputs(4, "cuda", torch.float32, 4)
+    for exact in (False, True):
+        layer = SomaLayer("soma", lod=lod, device="cuda", exact=exact)
+        synchronisations_of(layer, *inputs(4, "cuda", torch.float32, 4))
+        print(f"exact={exact}: the host waits nowhere")
+
+
+def synchronisations_of(layer, rotations, translation, shape):
     with torch.no_grad():
         layer({"shape": shape}, rotations, translation)
         torch.cuda.set_sync_debug_mode("error")
@@ -129,7 +152,6 @@ def synchronisations(lod):
             layer({"shape": shape}, rotations, translation)
         finally:
             torch.cuda.set_sync_debug_mode("default")
-    print("the host waits nowhere")
 
 
 if __name__ == "__main__":
@@ -142,6 +164,7 @@ if __name__ == "__main__":
         lambda: gradients(LOD),
         lambda: synchronisations(LOD),
         lambda: times(LOD),
+        lambda: groups(LOD),
         lambda: kernels(LOD),
     ):
         try:

@@ -1,12 +1,12 @@
 """Correctness and speed on a GPU, in one go: what is known so far is on disk after every row.
 
-    python benchmarks/gpu.py --device cuda --out FOLDER --peer PEER     everything, in six minutes
-    python benchmarks/gpu.py --device cpu --quick --out FOLDER          the same at toy sizes
-    python benchmarks/gpu.py --table FOLDER/gpu.json                    its table, into benchmarks/README.md
+    python benchmarks/gpu.py --device cuda --out FOLDER --peer PEER    everything
+    python benchmarks/gpu.py --device cpu --quick --out FOLDER        the same at toy sizes
+    python benchmarks/gpu.py --table FOLDER/gpu.json                  its table, for benchmarks/README.md
 
 This process only watches: the sections run in another one. Where that one dies or hangs, a new one goes on
-after the row that was its end. PEER is a folder with ``site`` (py-soma-x); its assets are made there when first
-needed. On CUDA all kernels are compiled first, in as many processes as there are cores.
+after the row that was its end. PEER is a folder with ``site`` (py-soma-x); its assets are made there when
+first needed. On CUDA all kernels are compiled first, in as many processes as there are cores.
 """
 
 from __future__ import annotations
@@ -156,9 +156,10 @@ def main() -> None:
     if options.table:
         from run import insert
 
-        text = gpu_table(_load(options.table))
-        for file in (HERE / "README.md", ROOT / "README.md"):
-            insert(file, "gpu", text)
+        state = _load(options.table)
+        text = gpu_table(state)
+        if not state["options"]["quick"]:  # toy sizes are nobody's figures
+            insert(HERE / "README.md", "gpu", text)
         sys.stdout.write(text + "\n")
         return
     path = begin(options)

@@ -165,7 +165,9 @@ class Bench:
         begin = time.perf_counter()
         times = self._by_events(call, sets, count) if self.cuda else _by_clock(call, sets, count)
         whole = 1e3 * (time.perf_counter() - begin) / count
-        low, middle, high = statistics.quantiles(times, n=4) if len(times) > 1 else 3 * times
+        low, middle, high = (
+            statistics.quantiles(times, n=4, method="inclusive") if len(times) > 1 else 3 * times
+        )
         return {"ms": middle, "p25_ms": low, "p75_ms": high, "mean_ms": whole, "launches": count}
 
     def _by_events(self, call: Callable[[int], Any], sets: int, count: int) -> list[float]:

@@ -136,8 +136,28 @@ def _layer_row(bench: Bench, backend: str, kind: str, dtype: torch.dtype, batch:
         row[f"slope_{name}"] = float((mine - theirs).abs().max() / theirs.abs().max())
     row["bound_slope"] = SLOPE[dtype]
     slopes = [row[f"slope_{name}"] for name in ("rotations", "translation", "params")]
-    row["ok"] = row["mm_to_float64"] <= LAYER_MM[dtype] and max(slopes) <= SLOPE[dtype]
+    row["mm_without_gradients"], row["mm_pose"] = _without_gradients(
+        layer_of(backend, kind, str(bench.device), dtype), params, poses, shift, expected[0]
+    )
+    far = max(row[name] for name in ("mm_to_float64", "mm_without_gradients", "mm_pose"))
+    row["ok"] = far <= LAYER_MM[dtype] and max(slopes) <= SLOPE[dtype]
     return row
+
+
+@torch.no_grad()
+def _without_gradients(
+    layer: SomaLayer, params: dict[str, Tensor], poses: Tensor, shift: Tensor, expected: Tensor
+) -> tuple[float, float]:
+    """The same by the kernels that have no derivative: the layer [mm], and poses of its first body."""
+    given = {name: value.to(layer.device, layer.dtype) for name, value in params.items()}
+    poses, shift = (part.to(layer.device, layer.dtype) for part in (poses, shift))
+    first = layer.identity({name: value[:1] for name, value in given.items()})
+    same = layer.pose(first, poses[:1], shift[:1]).vertices  # one body, in the first of its poses
+    many = layer.pose(first, poses, shift).vertices
+    one_by_one = torch.cat([layer.pose(first, poses[i : i + 1], shift[i : i + 1]).vertices
+                            for i in range(len(poses))])  # fmt: skip
+    off = max(far_mm(same, expected[:1]), far_mm(many, one_by_one))
+    return far_mm(layer(given, poses, shift).vertices, expected), off
 
 
 def _moved(layer: SomaLayer, params: dict[str, Tensor], poses: Tensor, shift: Tensor) -> tuple:

@@ -57,9 +57,25 @@ def _tables(state: dict) -> Iterator[Table]:
              _verdict(row)] for row in _rows(state, "kernels")]  # fmt: skip
     head = ["kernel", "error", "bound", "gradient", "bound", "first call, s", "ok"]
     yield "Kernels on the device against torch in float64 on the CPU", head, rows
-    keys = ("mm_to_float64", "mm_to_cpu", "slope_rotations", "slope_translation", "slope_params")
+    keys = (
+        "mm_to_float64",
+        "mm_without_gradients",
+        "mm_pose",
+        "slope_rotations",
+        "slope_translation",
+        "slope_params",
+    )
     rows = [[row["name"], *_cells(row, *keys), _verdict(row)] for row in _rows(state, "layer")]
-    head = ["layer", "mm to float64", "mm to the CPU", "rotations", "translation", "parameters", "ok"]
+    head = [
+        "layer",
+        "mm to float64",
+        "without gradients",
+        "pose",
+        "rotations",
+        "translation",
+        "parameters",
+        "ok",
+    ]
     yield "The layer on the device, and its gradients against float64 on the CPU", head, rows
     keys = ("mean_mm", "max_mm", "max_degrees", "converged")
     rows = [[row["name"], *_cells(row, *keys, "first_s"), _verdict(row)] for row in _rows(state, "fit")]
@@ -116,7 +132,12 @@ def _trouble(state: dict) -> list[str]:
     for name, section in state["sections"].items():
         lines.append(f"{name}: {section['status']}, {section['seconds']:.0f} s, "
                      f"{len(section['rows'])} rows. {section.get('why', '')[-200:]}".strip())  # fmt: skip
+        skipped = [row["name"] for row in section["rows"] if row["status"] == "skipped"]
+        if skipped:
+            lines.append(f"- no time for {len(skipped)} rows: {', '.join(skipped)}"[:400])
         for row in section["rows"]:
+            if row["status"] == "skipped":
+                continue
             if row["status"] != "done" or row.get("ok") is False or row["name"] == "none":
                 wrong = "" if row.get("ok") is not False else " WRONG"
                 lines.append(f"- {row['name']}: {row['status']}{wrong} {row.get('why', '')[:150]}".rstrip())

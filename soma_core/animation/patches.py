@@ -14,7 +14,7 @@ import numpy as np
 import scipy.sparse
 import torch
 
-from soma_core.kernels._posing_text import PATCH_ACTIVATIONS, PATCH_JOINTS, PATCH_VERTICES
+from soma_core.kernels._patch_text import PATCH_ACTIVATIONS, PATCH_JOINTS, PATCH_VERTICES
 
 __all__ = ["Patches", "side_by_side"]
 

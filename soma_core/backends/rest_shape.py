@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from soma_core.backends.parameters import batch_parameters
+from soma_core.geometry.torch_func import untracked
 from soma_core.plugin.errors import PluginError, Stage
 from soma_core.plugin.spec import BackendSpec, Generator, HasLinearBasis, LinearBasis
 from soma_core.rig.mesh import CanonicalMesh
@@ -107,7 +108,7 @@ class ComposedRestShape(torch.nn.Module):
         coefficients = self.coefficients(params)
         rows = coefficients
         if rows.device.type != "cpu":  # a body's numbers lie together, as the kernels that follow read them
-            stacked = torch.addmm(self.template.T, rows, self.basis.T).T
+            stacked = torch.addmm(self.template.flatten(), rows, self.basis.T).T
         else:
             if len(rows) == 1:  # MKL multiplies by two columns three times faster than by one
                 rows = torch.cat((rows, rows))
@@ -117,7 +118,11 @@ class ComposedRestShape(torch.nn.Module):
         moments = stacked[size:].unflatten(0, (4 * self.fit.joint_count, 3))
         if self.exact is not None:
             offsets = self.exact.evaluate(coefficients)
-            points = points.index_add(1, self.offset_place, offsets[self.offset_chosen].transpose(0, 1))
+            inplace = points.device.type != "cpu" and untracked(
+                points, offsets
+            )  # spares a copy of all bodies
+            add = points.index_add_ if inplace else points.index_add
+            points = add(1, self.offset_place, offsets[self.offset_chosen].transpose(0, 1))
             moments = moments + (self.offset_moments @ offsets.flatten(1)).view(*moments.shape)
         moments = moments.unflatten(0, (self.fit.joint_count, 4)).permute(3, 0, 1, 2)
         if self.reduction is not None:

@@ -12,7 +12,8 @@ import warp as wp
 from torch import Tensor
 
 from soma_core.kernels._native import native
-from soma_core.kernels._posing_text import body_text, patch_text
+from soma_core.kernels._patch_text import patch_text
+from soma_core.kernels._posing_text import body_text
 from soma_core.kernels._runtime import as_warp, launching, scalar_name
 
 __all__ = ["pose_bodies", "skin_patches"]
@@ -22,6 +23,8 @@ _FEW = 8
 """Bodies up to which each has its own blocks of skin: what counts then is to keep the device busy."""
 _GROUP = {"float32": 8, "float64": 4}
 """Bodies that share one reading of the weights; as many bytes in shared memory in both precisions."""
+_WORDS = {"float32": 4, "float64": 2}
+"""Numbers that a thread loads from shared memory at once, 16 bytes."""
 
 _ints, _shorts = wp.array(dtype=wp.int32), wp.array(dtype=wp.int16)
 
@@ -69,7 +72,7 @@ def _patch_kernel(scalar: str, *, single: bool) -> wp.Kernel:
         ...
 
     skin_patch.__name__ = "skin_patch_of_one" if single else "skin_patch_of_many"
-    skin_patch = native(patch_text(group, max(group // 2, 1)), scalar, 1, skin_patch)
+    skin_patch = native(patch_text(group, min(group, _WORDS[scalar])), scalar, 1, skin_patch)
     module = wp.get_module(f"soma_skin_patches_{'one' if single else 'many'}_{scalar}")
 
     @wp.kernel(module=module, enable_backward=False, grid_stride=False)

@@ -17,12 +17,11 @@ __all__ = ["fitted_world", "to_bind_pose"]
 _ids = wp.array(dtype=wp.int64)
 
 
-@functools.cache
-def _kernels(scalar: str) -> SimpleNamespace:
+def _functions(scalar: str, module: wp.Module) -> tuple[wp.Function, wp.Function, wp.Function]:
+    """A transform of a rotation and a place, and both of a transform."""
     real = getattr(wp, scalar)
     vec3, mat33 = wp.types.vector(3, real), wp.types.matrix((3, 3), real)
-    mat44, mat34 = wp.types.matrix((4, 4), real), wp.types.matrix((3, 4), real)
-    module = wp.get_module(f"soma_identity_{scalar}")
+    mat44 = wp.types.matrix((4, 4), real)
 
     @wp.func(module=module)
     def joined(rotation: mat33, place: vec3):
@@ -44,6 +43,17 @@ def _kernels(scalar: str) -> SimpleNamespace:
     @wp.func(module=module)
     def place_of(world: mat44):
         return vec3(world[0, 3], world[1, 3], world[2, 3])
+
+    return joined, turn_of, place_of
+
+
+@functools.cache
+def _kernels(scalar: str) -> SimpleNamespace:
+    real = getattr(wp, scalar)
+    vec3, mat33 = wp.types.vector(3, real), wp.types.matrix((3, 3), real)
+    mat44, mat34 = wp.types.matrix((4, 4), real), wp.types.matrix((3, 4), real)
+    module = wp.get_module(f"soma_identity_{scalar}")
+    joined, turn_of, place_of = _functions(scalar, module)
 
     @wp.kernel(module=module, enable_backward=False)
     def assemble(
