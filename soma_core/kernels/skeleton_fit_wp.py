@@ -71,10 +71,11 @@ def _fan_covariance(types: SimpleNamespace, module: wp.Module, pair_normal: wp.F
             c = wp.int32(children[p, e])
             bone, reach = first * (bind[c] - bind[k]), joints[b, c] - joints[b, k]
             total += wp.outer(reach, bone)
-            for f in range(children.shape[1]):  # every pair comes twice; equal ones and the padding add zero
+            for f in range(children.shape[1]):  # every pair comes twice; the padding adds zero
                 d = wp.int32(children[p, f])
-                other, far = first * (bind[d] - bind[k]), joints[b, d] - joints[b, k]
-                total += real(0.5) * pair_normal(bone, other, reach, far)
+                if d != c:  # fused products leave rounding in a vector's product with itself, and it is scaled
+                    other, far = first * (bind[d] - bind[k]), joints[b, d] - joints[b, k]
+                    total += real(0.5) * pair_normal(bone, other, reach, far)
         return total
 
     return fan_covariance
@@ -119,10 +120,11 @@ def _pull_back(
                 bone_pull, reach_pull = wp.transpose(pull) * reach, pull * bone
                 for f in range(children.shape[1]):
                     d = wp.int32(children[p, f])
-                    other, far = first * (bind[d] - bind[k]), joints[b, d] - joints[b, k]
-                    of_bone, of_reach = pair_gradient(bone, other, reach, far, pull)
-                    bone_pull += of_bone
-                    reach_pull += of_reach
+                    if d != c:
+                        other, far = first * (bind[d] - bind[k]), joints[b, d] - joints[b, k]
+                        of_bone, of_reach = pair_gradient(bone, other, reach, far, pull)
+                        bone_pull += of_bone
+                        reach_pull += of_reach
                 first_pull += wp.outer(bone_pull, rest)
                 wp.atomic_add(joints_grad, b, c, reach_pull)  # zero for the padding
                 at_pivot -= reach_pull
