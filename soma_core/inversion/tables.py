@@ -272,6 +272,7 @@ class _Modes:
             "response_size": int(lists["response_start"][-1]),
             "mode_rows": max(s * 3 * (len(r) + 1) for s, r in zip(size, self.rows, strict=True)),
             "mode_tree": size[most] * 6 * len(self.trees[most]),
+            "opened": 3 * int((np.diff(lists["taken_start"]) * np.diff(lists["read_start"])).max()),
         }  # fmt: skip
         return lists, numbers
 

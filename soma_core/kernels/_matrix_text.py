@@ -16,7 +16,7 @@ ASSEMBLE = """
         for (int e = row_start[n]; e < row_start[n+1]; e++) {
             M x = column + 16 * row_joint[e]; for (int c = 0; c < 16; c++) x[c] = zero;
         }
-        M du = turns + 9 * u;
+        V du[9]; for (int i = 0; i < 9; i++) du[i] = turns[9*u+i];
         for (int e = near_start[n]; e < near_start[n+1]; e++) {
             int t = near_joint[e]; L m = second + 16 * near_pair[e];
             int row = near_flip[e] ? 1 : 4, col = near_flip[e] ? 4 : 1;
@@ -124,8 +124,34 @@ TWISTS = (
 """
 )
 
+_MIXED = """
+#define MIX(by, count, from, width, size, to, stride, more, unit) do { \\
+    for (int r = 0; r < (width); r++) { \\
+        M x_ = (from) + 3*r, t_ = (to); int m = 0; \\
+        for (; m + 4 <= (size); m += 4) { \\
+            const R* g_ = (by) + m * (count); V s_[12]; for (int i = 0; i < 12; i++) s_[i] = zero; \\
+            for (int l = 0; l < (count); l++, g_++) { \\
+                V x0 = x_[3*(width)*l], x1 = x_[3*(width)*l+1], x2 = x_[3*(width)*l+2]; \\
+                for (int i = 0; i < 4; i++) { R f = g_[i * (count)]; \\
+                    s_[3*i] += f * x0; s_[3*i+1] += f * x1; s_[3*i+2] += f * x2; } \\
+            } \\
+            for (int i = 0; i < 4; i++) { M o_ = t_ + (stride) * (m + i); for (int k = 0; k < 3; k++) \\
+                o_[k] = (more) ? o_[k] + (unit) * s_[3*i+k] : (unit) * s_[3*i+k]; } \\
+        } \\
+        for (; m < (size); m++) { \\
+            const R* g_ = (by) + m * (count); V s_[3] = {zero, zero, zero}; \\
+            for (int l = 0; l < (count); l++) for (int k = 0; k < 3; k++) \\
+                s_[k] += g_[l] * x_[3*(width)*l+k]; \\
+            M o_ = t_ + (stride) * m; for (int k = 0; k < 3; k++) \\
+                o_[k] = (more) ? o_[k] + (unit) * s_[k] : (unit) * s_[k]; \\
+        } \\
+    } } while (0)
+"""
+"""Products of a small matrix with vectors of three, four rows at a time: of each sum one number is written."""
+
 MODES = (
     _PLACED
+    + _MIXED
     + """
     V size = scale[0], most = size * shares[weighted_count];
     for (int i = 0; i < 9 * column_count; i++) mode_force[i] = zero;
@@ -152,22 +178,18 @@ MODES = (
     for (int p = 0; p < block_count; p++) {
         int reads = read_start[p+1] - read_start[p], size_p = mode_size[p],
             ids = taken_start[p+1] - taken_start[p];
-        M out = response + response_start[p];
-        for (int i = 0; i < 3 * size_p * reads; i++) out[i] = zero;
+        M o = opened;
         for (int c = 0; c < ids; c++) {
             V open = activity[taken[taken_start[p] + c]];
-            for (int r = 0; r < reads; r++, gates += W) {
-                M x = features + 3*W * read_used[read_start[p] + r]; V v0 = zero, v1 = zero,
-                    v2 = zero;
+            for (int r = 0; r < reads; r++, gates += W, o += 3) {
+                M x = features + 3*W * read_used[read_start[p] + r]; V v0 = zero, v1 = zero, v2 = zero;
                 for (int q = 0; q < W; q++) { v0 += gates[q] * x[q]; v1 += gates[q] * x[W+q];
                     v2 += gates[q] * x[2*W+q]; }
-                v0 *= open; v1 *= open; v2 *= open;
-                for (int m = 0; m < size_p; m++) {
-                    R f = mixed[m*ids+c]; M y = out + 3 * (m*reads + r);
-                    y[0] += f * v0; y[1] += f * v1; y[2] += f * v2;
-                }
+                o[0] = v0 * open; o[1] = v1 * open; o[2] = v2 * open;
             }
         }
+        M y = response + response_start[p];
+        MIX(mixed, ids, opened, reads, size_p, y + 3*r, 3*reads, false, one);
         mixed += size_p * ids;
     }
     const R* moment = cloud_moment; const R* grams = gram; const int* into = near_rows;
@@ -219,14 +241,8 @@ MODES = (
         }
         for (int e = near_start_mode[p]; e < near_start_mode[p+1]; e++) {
             int b = near_block[e], size_b = mode_size[b], seen = read_start[b+1] - read_start[b];
-            for (int m = 0; m < size_p; m++) for (int l = 0; l < size_b; l++) {
-                V h = grams[m*size_b+l] * most;
-                    M x = response + response_start[b] + 3*l*seen;
-                for (int r = 0; r < seen; r++) {
-                    M o = y + 3 * (size_p * into[r] + m);
-                    o[0] += h * x[3*r]; o[1] += h * x[3*r+1]; o[2] += h * x[3*r+2];
-                }
-            }
+            MIX(grams, size_b, response + response_start[b], seen, size_p, y + 3 * size_p * into[r], 3, true,
+                most);
             grams += size_p * size_b; into += seen;
         }
         M a = response + response_start[p];
@@ -285,10 +301,10 @@ FACTOR = """
         INVERSE(i2, (a)[2*(w)+2] - l20_ * l20_ - l21_ * l21_); \\
         (a)[w] = l10_; (a)[2*(w)] = l20_; (a)[2*(w)+1] = l21_; (i)[0] = i0; (i)[1] = i1; (i)[2] = i2; \\
         } while (0)
-    #define ELIMINATE(o, w, a, wa, b, wb) do { for (int r_ = 0; r_ < 3; r_++) for (int c_ = 0; \\
-        c_ < 3; c_++) \\
-        (o)[(w)*r_+c_] -= (a)[(wa)*r_] * (b)[(wb)*c_] + (a)[(wa)*r_+1] * (b)[(wb)*c_+1] \\
-            + (a)[(wa)*r_+2] * (b)[(wb)*c_+2]; } while (0)
+    #define ELIMINATE(o, w, a, wa, b, wb) do { for (int r_ = 0; r_ < 3; r_++) { \\
+        V x_ = (a)[(wa)*r_], y_ = (a)[(wa)*r_+1], z_ = (a)[(wa)*r_+2]; \\
+        for (int c_ = 0; c_ < 3; c_++) (o)[(w)*r_+c_] -= \\
+            x_ * (b)[(wb)*c_] + y_ * (b)[(wb)*c_+1] + z_ * (b)[(wb)*c_+2]; } } while (0)
     for (int n = driven_count; n < column_count; n++) {
         int first = block_start[n], stop = block_start[n+1], e = update_start[n];
         M d = blocks + 12 * first; M i = inverse + 3*n;
@@ -300,9 +316,11 @@ FACTOR = """
             b[0] = x; b[1] = y; b[2] = (b[2] - x * l20 - y * l21) * i[2];
         }
         for (int a = first + 1; a < stop; a++) {
+            M from = blocks + 12*a; V own[9];
+            for (int r = 0; r < 3; r++) for (int c = 0; c < 3; c++) own[3*r+c] = from[4*r+c];
             for (int b = a; b < stop; b++, e++)
-                ELIMINATE(blocks + 12 * update_target[e], 4, blocks + 12*b, 4, blocks + 12*a, 4);
-            ELIMINATE(carry + 9 * block_row[a], 3, carry + 9*n, 3, blocks + 12*a, 4);
+                ELIMINATE(blocks + 12 * update_target[e], 4, blocks + 12*b, 4, own, 3);
+            ELIMINATE(carry + 9 * block_row[a], 3, carry + 9*n, 3, own, 3);
         }
         ELIMINATE(last, 3, carry + 9*n, 3, carry + 9*n, 3);
     }

@@ -26,7 +26,7 @@ NUMBERS = (
     "mix_value", "drive_value", "cross_value", "spin_axis", "gate", "mode", "cloud_moment", "fold_value",
     "gram", "left", "right", "feature_left", "feature_right", "feature_still", "weigh_value",
 )  # fmt: skip
-EXTRA = ("response_size", "mode_rows", "mode_tree")
+EXTRA = ("response_size", "mode_rows", "mode_tree", "opened")
 """Further counts, of memory alone."""
 
 KEPT = ("blocks", "carry", "last", "inverse")
@@ -47,7 +47,7 @@ def slot_sizes(n: Mapping[str, int]) -> dict[str, int]:
         "before": n["activation_count"], "pull": n["activation_count"],
         "feature": 3 * n["feature_columns"] * n["feature_count"], "transform": 12 * a, "push": 12 * a,
         "features": 9 * n["feature_columns"] * n["used_count"], "response": n["response_size"],
-        "mode_rows": n["mode_rows"], "mode_tree": n["mode_tree"],
+        "mode_rows": n["mode_rows"], "mode_tree": n["mode_tree"], "opened": n["opened"],
         "mode_force": 9 * c if n["block_count"] else 0,
         "selected": 9 * (n["slot_count"] + c + 1),
     }  # fmt: skip

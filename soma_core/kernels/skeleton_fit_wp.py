@@ -73,7 +73,9 @@ def _fan_covariance(types: SimpleNamespace, module: wp.Module, pair_normal: wp.F
             total += wp.outer(reach, bone)
             for f in range(children.shape[1]):  # every pair comes twice; the padding adds zero
                 d = wp.int32(children[p, f])
-                if d != c:  # fused products leave rounding in a vector's product with itself, and it is scaled
+                if (
+                    d != c
+                ):  # fused products leave rounding in a vector's product with itself, and it is scaled
                     other, far = first * (bind[d] - bind[k]), joints[b, d] - joints[b, k]
                     total += real(0.5) * pair_normal(bone, other, reach, far)
         return total
