@@ -37,11 +37,8 @@ __all__ = ["PoseInversion", "Topology"]
 
 Topology = Literal["canonical", "native"]
 
-_CHUNK, _CHUNK_ON_GPU = 512, 65536
+_CHUNK = 512
 """Frames fitted at a time: enough to fill the SIMD lanes of every core, little enough for memory."""
-
-_SHARE_OF_MEMORY = 0.4
-"""Of a GPU's free memory, for a chunk of frames."""
 
 _SCALES = (0.2, 5.0)
 """A body this much smaller or larger than its identity is in another unit, or no body."""
@@ -271,19 +268,12 @@ class PoseInversion(Derived):
 
     def _fit_all(self, frames: _Frames) -> InversionResult:
         """Fit chunk by chunk."""
-        count, size = len(frames.vertices), _CHUNK if self.device.type == "cpu" else self._chunk_on_gpu()
+        count, size = len(frames.vertices), max(_CHUNK, self.model.frames_on_gpu())
         starts = range(0, count, size) or (0,)
         fits = [self._fit(frames.part(slice(first, first + size))) for first in starts]
         if not any(bool(result.valid.any()) for result, _ in fits):
             refuse_unit_error(torch.cat([scale for _, scale in fits]))
         return joined([result for result, _ in fits])
-
-    def _chunk_on_gpu(self) -> int:
-        """As many frames as there is room for: the more, the better a GPU is used."""
-        free, _ = torch.cuda.mem_get_info(self.device)
-        free += torch.cuda.memory_reserved(self.device) - torch.cuda.memory_allocated(self.device)
-        room = int(_SHARE_OF_MEMORY * free / self.model.frame_bytes)
-        return max(_CHUNK, min(room, _CHUNK_ON_GPU))
 
     @own_precision
     def canonical(self, vertices: Tensor, topology: Topology) -> Tensor:

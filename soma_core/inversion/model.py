@@ -22,6 +22,9 @@ from soma_core.skeleton.identity import Identity
 
 __all__ = ["PoseModel"]
 
+_MOST_FRAMES, _SHARE_OF_MEMORY = 65536, 0.4
+"""Frames fitted at a time on a GPU, and what they may take of its free memory."""
+
 
 class PoseModel(SkinModel):
     """Skinning of one layer, with or without twist joints and correctives, and the solver of its poses.
@@ -104,6 +107,22 @@ class PoseModel(SkinModel):
         if self.some is not None:
             weights = weights[:, self.some]
         return self.rest(self.seen(identity), weights)
+
+    def frames_on_gpu(self) -> int:
+        """Frames that are fitted together on a GPU: as many as it has room for, since more use it better."""
+        where = self.solver.eye
+        if not where.is_cuda:
+            return 0
+        free, _ = torch.cuda.mem_get_info(where.device)
+        free += torch.cuda.memory_reserved(where.device) - torch.cuda.memory_allocated(where.device)
+        return min(int(_SHARE_OF_MEMORY * free / self.frame_bytes), _MOST_FRAMES)
+
+    @property
+    def frame_bytes(self) -> int:
+        """What a frame takes in a fit by kernels on a GPU, its targets among it."""
+        solver = 0 if self._steps is None else self._steps.memory + 2 * self._steps.kept
+        vertices = 9 * len(self.fitted)  # targets, some of them once more, distances and their marks
+        return (solver + vertices + 8192) * self.solver.eye.element_size()
 
     def scale(self, problem: Problem) -> Tensor:
         """Size of the bodies beside the canonical one, (1 or F,)."""

@@ -120,13 +120,6 @@ class SkinModel(torch.nn.Module):
         twin._steps = None
         return twin
 
-    @property
-    def frame_bytes(self) -> int:
-        """What a frame takes in a fit by kernels on a GPU, its targets among it."""
-        solver = 0 if self._steps is None else self._steps.memory + 2 * self._steps.kept
-        vertices = 9 * len(self.fitted)  # targets, some of them once more, distances and their marks
-        return (solver + vertices + 8192) * self.solver.eye.element_size()
-
     def _step_kernels(self) -> PoseSolver:
         from soma_core.kernels.pose_solver_wp import PoseSolver
 

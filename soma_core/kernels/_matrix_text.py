@@ -147,7 +147,7 @@ _MIXED = """
         } \\
     } } while (0)
 """
-"""Products of a small matrix with vectors of three, four rows at a time: of each sum one number is written."""
+"""Products of a small matrix with vectors of three, four rows at a time; each sum is written once."""
 
 MODES = (
     _PLACED
