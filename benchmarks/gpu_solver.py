@@ -65,7 +65,7 @@ def _build(kind: str, what: str, dtype: torch.dtype, device: torch.device, *, wa
     layer, model = _model(kind, dtype, device, warp=warp)
 
     def run(seen: Tensor, turns: Tensor, hips: Tensor) -> Values:
-        identity = layer.identity({"shape": randn(1, 16, seed=4).to(dtype)})
+        identity = layer.identity({"shape": randn(1, 16, seed=4).to(device, dtype)})
         weights = torch.as_tensor(model.fitted, dtype=dtype, device=device)[None]
         problem = model.problem(seen, identity, weights, None, None, None)
         eye = torch.eye(3, dtype=dtype, device=device).expand(len(turns), 1, 3, 3)

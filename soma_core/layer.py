@@ -29,7 +29,7 @@ from soma_core.compiled import CompiledLayer
 from soma_core.correctives.model import find_correctives, load_correctives
 from soma_core.errors import InputError
 from soma_core.geometry.rotations import axis_angle_to_matrix
-from soma_core.geometry.torch_func import transformed, untracked
+from soma_core.geometry.torch_func import untracked
 from soma_core.plugin.registry import Registry, default_registry
 from soma_core.rig import load_canonical
 from soma_core.rig.mesh import CanonicalMesh, Lod
@@ -127,18 +127,20 @@ class SomaLayer(Derived):
             self.correctives_file, self.mesh, self.rig, dtype=dtype, device=device
         )
         self.fused: FusedPose | None = None
-        if device.type == "cuda" and self.kernels != "torch":
-            self.fuse()
+        if self.kernels != "torch":
+            self.fuse(by_patches=device.type == "cuda")
 
-    def fuse(self) -> None:
-        """Let few kernels do what no gradient is asked of, as a layer on CUDA does; no derivative is lost.
+    def fuse(self, *, by_patches: bool = True) -> None:
+        """Let few kernels do what no gradient is asked of; no derivative is lost.
 
-        On the CPU, where it serves tests, the kernels run on one core.
+        `by_patches` is how a GPU does it. On a CPU, where that serves tests, it runs on one core.
         """
-        fused = FusedPose(self.posing, self.correctives, dtype=self.dtype, device=self.device)
+        fused = FusedPose(
+            self.posing, self.correctives, dtype=self.dtype, device=self.device, by_patches=by_patches
+        )
         self.fused = fused if fused.fits else None
-        self.animation.fuse()
-        self.rest_shape.fit.rotations.fused = True
+        self.animation.fuse(by_patches=by_patches)
+        self.rest_shape.fit.rotations.fused = by_patches
 
     def extra_repr(self) -> str:
         """What was chosen, for ``repr``."""
@@ -358,23 +360,28 @@ class SomaLayer(Derived):
         bone_scale = check_bone_scale(bone_scale, size, len(self.joint_names), self.dtype, self.device)
         relative = relative.expand(size, *relative.shape[1:])
         given = (*batch.values(), relative, shift, *([] if bone_scale is None else [bone_scale]))
-        tracked = torch.is_grad_enabled() and any(tensor.requires_grad for tensor in given)
-        tracked = tracked or torch.compiler.is_compiling() or transformed()  # a compiler plans its own memory
-        whole = tracked or identities < size or size <= _CHUNK or self.animation.warp_skinning
-        whole = whole or self.fused is not None
-        if whole:
+        small = size <= _CHUNK or self.animation.warp_skinning
+        at_once = self.fused.patches is not None if self.fused is not None else small
+        if (
+            not untracked(*given) or identities < size or at_once or not size
+        ):  # a compiler plans its own memory
             identity = self._identity(batch, *self.rest_shape(batch))
             return self.pose_checked(Body(identity, relative, shift, bone_scale), absolute=absolute)
 
-        def body(chunk: slice) -> Body:
+        def part_of(chunk: slice) -> tuple[dict[str, Tensor], Tensor, Tensor, Tensor | None]:
             part = {name: value[chunk] for name, value in batch.items()}
             scale = None if bone_scale is None else bone_scale.expand(size, -1)[chunk]
-            identity = self._identity(part, *self.rest_shape(part))
-            moves = self._offsets(identity, relative[chunk], absolute=absolute)
-            return Body(identity, relative[chunk], shift[chunk], scale, moves)
+            return part, relative[chunk], shift[chunk], scale
 
-        bodies = (body(slice(start, start + _CHUNK)) for start in range(0, size, _CHUNK))
-        return self.posing.pose_all(bodies, size, absolute=absolute)
+        def body(part: dict[str, Tensor], turns: Tensor, place: Tensor, scale: Tensor | None) -> Body:
+            identity = self._identity(part, *self.rest_shape(part))
+            return Body(identity, turns, place, scale, self._offsets(identity, turns, absolute=absolute))
+
+        parts = (part_of(slice(start, start + _CHUNK)) for start in range(0, size, _CHUNK))
+        if self.fused is None:
+            return self.posing.pose_all((body(*part) for part in parts), size, absolute=absolute)
+        rested = ((*self.rest_shape(part), *rest) for part, *rest in parts)
+        return self.fused.whole(rested, size, self.animation if self.repose else None, absolute=absolute)
 
     if TYPE_CHECKING:  # torch says that a module returns anything
         __call__ = forward

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import Literal, NamedTuple
+from typing import TYPE_CHECKING, Literal, NamedTuple
 
 import torch
 from torch import Tensor
@@ -16,6 +16,9 @@ from soma_core.animation.twist import Twist
 from soma_core.geometry.torch_func import transformed, untracked
 from soma_core.rig.skeleton import Rig
 from soma_core.skeleton.identity import Identity
+
+if TYPE_CHECKING:
+    from soma_core.kernels.body_skin_wp import Blend
 
 __all__ = ["Animation", "Body", "ProceduralAnimation"]
 
@@ -48,13 +51,19 @@ class Animation(torch.nn.Module):
         self.skinning = Skinning(rig.weights, dtype=dtype, device=device)
         self.posed_skinning = self.skinning
         self.patches: Patches | None = None
+        self.blend: Blend | None = None
 
-    def fuse(self) -> None:
-        """Make :meth:`repose` two kernels where no gradient is asked: what a GPU takes."""
-        weights, kinematics = self.skinning.weights, self.kinematics
+    def fuse(self, *, by_patches: bool) -> None:
+        """Skin :meth:`repose` by one kernel where no gradient is asked; `by_patches` as a GPU does."""
+        weights, kinematics = self.skinning.weights.scipy(), self.kinematics
         device, dtype = kinematics.orient.device, kinematics.orient.dtype
-        patches = Patches(weights.scipy(), None, dtype=dtype, device=device)
-        self.patches = patches if patches.fits else None
+        if by_patches:
+            patches = Patches(weights, None, dtype=dtype, device=device)
+            self.patches = patches if patches.fits else None
+            return
+        from soma_core.kernels.body_skin_wp import blend_of
+
+        self.blend = blend_of(weights, dtype=dtype)
 
     def repose(self, points: Tensor, fitted: Tensor) -> tuple[Tensor, Tensor]:
         """Bring fitted bodies to the rig's bind pose.
@@ -68,15 +77,23 @@ class Animation(torch.nn.Module):
         """
         if self.patches is not None and untracked(points, fitted):
             return self._repose_fused(self.patches, points, fitted)
-        kinematics = self.kinematics
-        positions = kinematics.bind_positions(kinematics.local_offsets(fitted), fitted[:, 1, :3, 3])
-        rotations = kinematics.bind_rotation.expand(len(fitted), -1, 3, 3)
-        transforms = skinning_transforms(rotations, positions, fitted)
-        if self.warp_skinning and not transformed():
+        transforms, world = self.to_bind_pose(fitted)
+        if self.blend is not None and untracked(points, fitted):
+            from soma_core.kernels.body_skin_wp import skin_bodies
+
+            skinned = skin_bodies(points.permute(2, 1, 0), transforms, self.blend).permute(2, 1, 0)
+        elif self.warp_skinning and not transformed():
             skinned = _skin_warp(self.skinning, points.permute(2, 1, 0), transforms).permute(2, 1, 0)
         else:
             skinned = self.skinning(points, transforms, rows=False)
-        return skinned, to_homogeneous(rotations, positions)
+        return skinned, world
+
+    def to_bind_pose(self, fitted: Tensor) -> tuple[Tensor, Tensor]:
+        """Transforms (B, J, 3, 4) that bring fitted bodies to the bind pose, and (B, J, 4, 4) of them there."""
+        kinematics = self.kinematics
+        positions = kinematics.bind_positions(kinematics.local_offsets(fitted), fitted[:, 1, :3, 3])
+        rotations = kinematics.bind_rotation.expand(len(fitted), -1, 3, 3)
+        return skinning_transforms(rotations, positions, fitted), to_homogeneous(rotations, positions)
 
     def _repose_fused(self, patches: Patches, points: Tensor, fitted: Tensor) -> tuple[Tensor, Tensor]:
         from soma_core.kernels.fused_pose_wp import skin_patches

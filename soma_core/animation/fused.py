@@ -1,6 +1,8 @@
-"""The forward pose in two kernels, for CUDA and where no gradient is asked (paper, section 3.5)."""
+"""The forward pose in two kernels, where no gradient is asked (paper, section 3.5)."""
 
 from __future__ import annotations
+
+from collections.abc import Iterable
 
 import numpy as np
 import torch
@@ -24,10 +26,13 @@ class FusedPose(torch.nn.Module):
         posing: joint tree, skin weights and twist joints.
         correctives: added on the way to the skin, or None.
         dtype, device: of constants and results.
+        by_patches: skin as a GPU does, by patches of the mesh, instead of by bodies in SIMD lanes.
 
     Attributes:
         fits: whether the rig and the correctives fit into the kernels' shared memory.
     """
+
+    patches: Patches | None = None
 
     def __init__(
         self,
@@ -36,6 +41,7 @@ class FusedPose(torch.nn.Module):
         *,
         dtype: torch.dtype,
         device: torch.device | str,
+        by_patches: bool,
     ) -> None:
         super().__init__()
         twist = posing.twist if isinstance(posing, ProceduralAnimation) else None
@@ -46,9 +52,16 @@ class FusedPose(torch.nn.Module):
         ints, reals = _body_tables(posing, twist, correctives)
         self.register_buffer("ints", torch.as_tensor(ints).to(device, torch.int32), persistent=False)
         self.register_buffer("reals", torch.as_tensor(reals).to(device, dtype), persistent=False)
-        self.patches = Patches(weights, second, dtype=dtype, device=device)
         channels = 0 if twist is None else len(twist.joint)
-        self.fits = self.patches.fits and max(posing.kinematics.joint_count, channels) <= JOINT_LIMIT
+        self.fits = max(posing.kinematics.joint_count, channels) <= JOINT_LIMIT
+        if by_patches:
+            self.patches = Patches(weights, second, dtype=dtype, device=device)
+            self.fits = self.fits and self.patches.fits
+            return
+        from soma_core.kernels.body_skin_wp import blend_of
+
+        self.skin = blend_of(weights, dtype=dtype)
+        self.moves = None if second is None else blend_of(second, dtype=dtype, rows=3)
 
     def forward(
         self,
@@ -69,19 +82,79 @@ class FusedPose(torch.nn.Module):
             absolute: `rotations` are local rotations of the rig's own axes.
             bone_scale: (1 or B, J - 1).
         """
-        from soma_core.kernels.fused_pose_wp import pose_bodies, skin_patches
+        world, joints, skin, active = self._bodies(
+            identity.bind_world, rotations, translation, absolute=absolute, bone_scale=bone_scale
+        )
+        if self.patches is None:
+            from soma_core.kernels.body_skin_wp import skin_bodies
+
+            vertices = skin_bodies(identity.rest, skin, self.skin, active=active, moves=self.moves)
+            return Posed(vertices=vertices, joints=joints, transforms=world)
+        from soma_core.kernels.fused_pose_wp import skin_patches
+
+        tables = self.patches
+        vertices = skin_patches(
+            identity.rest, skin, active, tables.ints, tables.shorts, tables.reals, patches=tables.count
+        )
+        return Posed(vertices=vertices, joints=joints, transforms=world)
+
+    def whole(
+        self,
+        bodies: Iterable[tuple[Tensor, Tensor, Tensor, Tensor, Tensor | None]],
+        batch: int,
+        animation: Animation | None,
+        *,
+        absolute: bool,
+    ) -> Posed:
+        """Pose chunks of bodies that nobody keeps: brought to the bind pose and posed in one pass.
+
+        Args:
+            bodies: of each chunk, fitted points as planes (3, v, B) [m] and transforms (B, J, 4, 4) [m];
+                rotations, translation and bone scale, as in :meth:`forward`.
+            batch: number of bodies in all.
+            animation: brings bodies to the bind pose; None leaves them as they are.
+            absolute: as in :meth:`forward`.
+        """
+        from soma_core.kernels.body_skin_wp import skin_bodies
+
+        vertices, found, start = None, [], 0
+        for points, fitted, rotations, translation, bone_scale in bodies:
+            if vertices is None:
+                vertices = points.new_empty(batch, points.shape[1], 3)
+            before, bind = (None, fitted) if animation is None else animation.to_bind_pose(fitted)
+            world, joints, skin, active = self._bodies(
+                bind, rotations, translation, absolute=absolute, bone_scale=bone_scale
+            )
+            stop = start + len(world)
+            skin_bodies(
+                points.permute(2, 1, 0), skin, self.skin, before=before,
+                first=None if animation is None else animation.blend, active=active, moves=self.moves,
+                out=vertices[start:stop],
+            )  # fmt: skip
+            found.append((joints, world))
+            start = stop
+        assert vertices is not None
+        joints, world = (torch.cat(parts) for parts in zip(*found, strict=True))
+        return Posed(vertices=vertices, joints=joints, transforms=world)
+
+    def _bodies(
+        self,
+        bind_world: Tensor,
+        rotations: Tensor,
+        translation: Tensor,
+        *,
+        absolute: bool,
+        bone_scale: Tensor | None,
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor | None]:
+        """World transforms, joints, skinning transforms, and activations where there are any."""
+        from soma_core.kernels.fused_pose_wp import pose_bodies
 
         world, joints, skin, active = pose_bodies(
-            rotations, translation, identity.bind_world, bone_scale, self.ints, self.reals,
+            rotations, translation, bind_world, bone_scale, self.ints, self.reals,
             batch=len(translation), helpers=self.helper_count, activations=self.activation_count,
             absolute=absolute,
         )  # fmt: skip
-        tables = self.patches
-        vertices = skin_patches(
-            identity.rest, skin, active if self.activation_count else None, tables.ints, tables.shorts,
-            tables.reals, patches=tables.count,
-        )  # fmt: skip
-        return Posed(vertices=vertices, joints=joints, transforms=world)
+        return world, joints, skin, active if self.activation_count else None
 
 
 def _body_tables(

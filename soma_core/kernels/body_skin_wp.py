@@ -107,7 +107,10 @@ def _kernel(scalar: str, lanes: int):
             for t in range(task.first, task.stop):
                 a = t * size
                 b = wp.min(a + size, task.vertices)
-                draw(points, by.body, by.vertex, by.axis, f, last, a, b, tile)
+                if by.axis == 1 and by.vertex == 3 and by.body > 1:
+                    load(points, by.body, 3 * a, 3 * (b - a), f, last, tile, 0)
+                else:
+                    draw(points, by.body, by.vertex, by.axis, f, last, a, b, tile)
                 if task.reposed > 0:
                     skin(first_start, first_joint, first_value, first, a, b, tile)
                 if task.activations > 0:

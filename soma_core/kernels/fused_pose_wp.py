@@ -11,6 +11,7 @@ import torch
 import warp as wp
 from torch import Tensor
 
+from soma_core.kernels._lanes import in_threads
 from soma_core.kernels._native import native
 from soma_core.kernels._patch_text import patch_text
 from soma_core.kernels._posing_text import body_text
@@ -45,13 +46,13 @@ def _body_kernel(scalar: str) -> wp.Kernel:
 
     @wp.kernel(module=wp.get_module(f"soma_pose_bodies_{scalar}"), enable_backward=False, grid_stride=False)
     def bodies(
-        threads: int, rotations: numbers, rotation_stride: int, axis_angle: int, absolute: int,
+        threads: int, first: int, rotations: numbers, rotation_stride: int, axis_angle: int, absolute: int,
         translation: numbers, translation_stride: int, bind_world: numbers, bind_stride: int, scaled: int,
         bone_scale: numbers, scale_stride: int, ints: _ints, reals: numbers, world: numbers, joints: numbers,
         skin: numbers, active: numbers,
     ):  # fmt: skip
         pose_body(
-            wp.tid() // threads, rotations, rotation_stride, axis_angle, absolute, translation,
+            first + wp.tid() // threads, rotations, rotation_stride, axis_angle, absolute, translation,
             translation_stride, bind_world, bind_stride, scaled, bone_scale, scale_stride, ints, reals,
             world, joints, skin, active,
         )  # fmt: skip
@@ -125,13 +126,18 @@ def _pose_bodies(
     bind_world, bind_stride = _rows(bind_world)
     scaled = bone_scale is not None
     stretch, scale_stride = _rows(bone_scale) if scaled else (reals, 0)
-    with launching(rotations) as device:
-        given = [
-            _flat(rotations), rotation_stride, int(axis_angle), int(absolute), _flat(translation),
-            translation_stride, _flat(bind_world), bind_stride, int(scaled), _flat(stretch), scale_stride,
-            as_warp(ints), as_warp(reals), _flat(world), _flat(joints), _flat(skin), _flat(active),
-        ]  # fmt: skip
-        _launch(_body_kernel(scalar_name(rotations.dtype)), batch, _BODY_THREADS, given, device)
+    given = [
+        _flat(rotations), rotation_stride, int(axis_angle), int(absolute), _flat(translation),
+        translation_stride, _flat(bind_world), bind_stride, int(scaled), _flat(stretch), scale_stride,
+        as_warp(ints), as_warp(reals), _flat(world), _flat(joints), _flat(skin), _flat(active),
+    ]  # fmt: skip
+    kernel = _body_kernel(scalar_name(rotations.dtype))
+
+    def run(part: slice) -> None:
+        with launching(rotations) as device:
+            _launch(kernel, part.stop - part.start, _BODY_THREADS, [part.start, *given], device)
+
+    in_threads(run, batch, rotations)
     return world, joints, skin, active
 
 
