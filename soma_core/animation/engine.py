@@ -89,7 +89,7 @@ class Animation(torch.nn.Module):
         return skinned, world
 
     def to_bind_pose(self, fitted: Tensor) -> tuple[Tensor, Tensor]:
-        """Transforms (B, J, 3, 4) that bring fitted bodies to the bind pose, and (B, J, 4, 4) of them there."""
+        """What brings fitted bodies to the bind pose, (B, J, 3, 4), and transforms there, (B, J, 4, 4)."""
         kinematics = self.kinematics
         positions = kinematics.bind_positions(kinematics.local_offsets(fitted), fitted[:, 1, :3, 3])
         rotations = kinematics.bind_rotation.expand(len(fitted), -1, 3, 3)

@@ -32,8 +32,6 @@ class FusedPose(torch.nn.Module):
         fits: whether the rig and the correctives fit into the kernels' shared memory.
     """
 
-    patches: Patches | None = None
-
     def __init__(
         self,
         posing: Animation,
@@ -52,6 +50,7 @@ class FusedPose(torch.nn.Module):
         ints, reals = _body_tables(posing, twist, correctives)
         self.register_buffer("ints", torch.as_tensor(ints).to(device, torch.int32), persistent=False)
         self.register_buffer("reals", torch.as_tensor(reals).to(device, dtype), persistent=False)
+        self.patches: Patches | None = None
         channels = 0 if twist is None else len(twist.joint)
         self.fits = max(posing.kinematics.joint_count, channels) <= JOINT_LIMIT
         if by_patches:
@@ -122,6 +121,8 @@ class FusedPose(torch.nn.Module):
             if vertices is None:
                 vertices = points.new_empty(batch, points.shape[1], 3)
             before, bind = (None, fitted) if animation is None else animation.to_bind_pose(fitted)
+            if before is not None:  # one body for all poses
+                before = before.expand(len(translation), -1, 3, 4)
             world, joints, skin, active = self._bodies(
                 bind, rotations, translation, absolute=absolute, bone_scale=bone_scale
             )

@@ -14,9 +14,12 @@ from soma_core.layer import SomaLayer
 from soma_core.rig import load_canonical
 from tests.animation.test_twist import ALIGNED, EULER, SWING, with_modes
 from tests.bodies import CPU, randn
-from tests.kernels.parity import DEVICES, DTYPES, GRADIENTS, VALUES_M
+from tests.kernels.parity import DTYPES, GRADIENTS, VALUES_M
 
 PARTS = ("vertices", "joints", "transforms")
+GPU = pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
+WAYS = [("cpu", False), ("cpu", True), pytest.param("cuda", True, marks=GPU)]
+"""Device, and whether by patches: in SIMD lanes, as a GPU does it, on a GPU."""
 
 
 def assert_same(got: Posed, expected: Posed):
@@ -36,11 +39,12 @@ def shapes(layer, count, seed=5):
     return {"shape": randn(count, 128, seed=seed, dtype=layer.dtype).to(layer.device)}
 
 
-def fast_twin(layer, device=CPU, **options):
-    """The same layer with kernels for what needs no gradient, on the CPU as well."""
+def fast_twin(layer, device=CPU, *, by_patches=True, **options):
+    """The same layer with kernels for what needs no gradient, those of a GPU on the CPU as well."""
     lod = layer.mesh.lod
     twin = SomaLayer(layer.backend, lod=lod, dtype=layer.dtype, device=device, **options)
-    twin.fuse()
+    if by_patches:
+        twin.fuse()
     assert twin.fused is not None
     return twin
 
@@ -51,17 +55,17 @@ def moved(parts, device):
 
 @pytest.fixture(scope="module", params=DTYPES, ids=str)
 def layer(request):
-    return SomaLayer("soma", lod="low", dtype=request.param)
+    return SomaLayer("soma", lod="low", dtype=request.param, kernels="torch")
 
 
-@pytest.mark.parametrize("device", DEVICES)
+@pytest.mark.parametrize(("device", "by_patches"), WAYS)
 @pytest.mark.parametrize("absolute", [False, True])
 @pytest.mark.parametrize(
     ("batch", "own", "scaled"), [(1, 0, 1), (3, 0, 0), (9, 0, 1), (21, 1, 0), (21, 1, 1)]
 )
 @torch.no_grad()
-def test_equals_the_layer(layer, batch, own, scaled, absolute, device):
-    twin = fast_twin(layer, device)
+def test_equals_the_layer(layer, batch, own, scaled, absolute, device, by_patches):
+    twin = fast_twin(layer, device, by_patches=by_patches)
     rotations, translation = poses(layer, batch)
     scale = 0.8 + 0.4 * torch.rand(batch, 77, dtype=layer.dtype) if scaled else None
     params = shapes(layer, batch if own else 1)
@@ -73,36 +77,38 @@ def test_equals_the_layer(layer, batch, own, scaled, absolute, device):
     assert_same(got, expected)
 
 
-@pytest.mark.parametrize("device", DEVICES)
+@pytest.mark.parametrize(("device", "by_patches"), WAYS)
 @pytest.mark.parametrize(
     "options",
     [{"correctives": None}, {"procedural": False}, {"repose": False}, {"exact": True}],
     ids=str,
 )
 @torch.no_grad()
-def test_equals_other_layers(options, device):
-    plain = SomaLayer("soma", lod="low", **options)
-    twin = fast_twin(plain, device, **options)
+def test_equals_other_layers(options, device, by_patches):
+    plain = SomaLayer("soma", lod="low", kernels="torch", **options)
+    twin = fast_twin(plain, device, by_patches=by_patches, **options)
     rotations, translation = poses(plain, 11)
     shape = shapes(plain, 11)["shape"]
     got = twin({"shape": shape.to(device)}, rotations.to(device), translation.to(device))
     assert_same(got, plain({"shape": shape}, rotations, translation))
 
 
+@pytest.mark.parametrize("by_patches", [False, True])
 @pytest.mark.parametrize("lod", ["mid", "xlo"])
 @torch.no_grad()
-def test_equals_at_every_lod(lod):
-    plain = SomaLayer("soma", lod=lod)
-    twin = fast_twin(plain)
+def test_equals_at_every_lod(lod, by_patches):
+    plain = SomaLayer("soma", lod=lod, kernels="torch")
+    twin = fast_twin(plain, by_patches=by_patches)
     rotations, translation = poses(plain, 10)
     assert_same(
         twin(shapes(plain, 10), rotations, translation), plain(shapes(plain, 10), rotations, translation)
     )
 
 
+@pytest.mark.parametrize("by_patches", [False, True])
 @torch.no_grad()
-def test_matrices_shared_poses_and_turns_of_any_size(layer):
-    twin = fast_twin(layer)
+def test_matrices_shared_poses_and_turns_of_any_size(layer, by_patches):
+    twin = fast_twin(layer, by_patches=by_patches)
     identity = layer.identity(shapes(layer, 4))
     for size in (0.0, 1e-5, 3.1, 6.0):
         rotations = size * torch.nn.functional.normalize(randn(1, 77, 3, dtype=layer.dtype), dim=-1)
@@ -129,7 +135,7 @@ def test_every_twist_mode(modes):
     rotations, translation = poses(layer, 5)
     matrices = torch.linalg.matrix_exp(_skewed(rotations))
     expected = posing.pose(identity, matrices, translation, absolute=False)
-    fused = FusedPose(posing, None, **kind)
+    fused = FusedPose(posing, None, by_patches=True, **kind)
     assert_same(fused(identity, matrices, translation, absolute=False), expected)
 
 
@@ -246,7 +252,7 @@ def test_operators_are_registered_soundly(layer):
 
 def test_the_tables_keep_the_weights(layer):
     """Every weight is there once: numbers of all patches add up to those of the matrices."""
-    fused = FusedPose(layer.posing, layer.correctives, dtype=torch.float64, device=CPU)
+    fused = FusedPose(layer.posing, layer.correctives, dtype=torch.float64, device=CPU, by_patches=True)
     numbers = float(fused.patches.reals.sum())
     second, weights = layer.correctives.second.scipy(), layer.posing.posed_skinning.weights.scipy()
     assert numbers == pytest.approx(second.sum() + weights.sum(), abs=1e-6)
