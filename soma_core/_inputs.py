@@ -16,6 +16,7 @@ __all__ = [
     "check_rest",
     "check_rotations",
     "check_translation",
+    "common_batch",
     "may_look",
     "widened",
 ]
@@ -195,3 +196,17 @@ def check_rest(rest: Tensor, vertex_count: int, dtype: torch.dtype, device: torc
         )
     _check_finite("rest", rest)
     return rest
+
+
+def common_batch(identities: int, poses: int) -> int:
+    """Bodies that come out of so many identities and poses, or a clear refusal."""
+    if identities == poses or poses == 1:
+        return identities
+    if identities == 1:
+        return poses
+    raise InputError(
+        "rotations",
+        got=f"a batch of {poses} for {identities} identities",
+        expected=f"a batch of {identities} or 1",
+        fix="Give one pose an identity, one pose for all, or one identity for all poses.",
+    )

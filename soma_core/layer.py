@@ -18,6 +18,7 @@ from soma_core._inputs import (
     check_rest,
     check_rotations,
     check_translation,
+    common_batch,
 )
 from soma_core.animation.engine import Animation, Body, ProceduralAnimation
 from soma_core.animation.fused import FusedPose
@@ -311,7 +312,7 @@ class SomaLayer(Derived):
             rotations, len(self.joint_names), self.dtype, self.device, validate=self.validate, convert=False
         )
         self.check_identity(identity)
-        batch = _common_batch(identity.batch_size, len(relative))
+        batch = common_batch(identity.batch_size, len(relative))
         shift = check_translation(translation, batch, self.dtype, self.device)
         bone_scale = check_bone_scale(bone_scale, batch, len(self.joint_names), self.dtype, self.device)
         if not self._fusible(identity, relative, shift, bone_scale):
@@ -355,7 +356,7 @@ class SomaLayer(Derived):
         if self.fused is None:
             relative = _matrices(relative)
         identities = len(next(iter(batch.values()), relative))
-        size = _common_batch(identities, len(relative))
+        size = common_batch(identities, len(relative))
         shift = check_translation(translation, size, self.dtype, self.device)
         bone_scale = check_bone_scale(bone_scale, size, len(self.joint_names), self.dtype, self.device)
         relative = relative.expand(size, *relative.shape[1:])
@@ -390,16 +391,3 @@ class SomaLayer(Derived):
 def _matrices(rotations: Tensor) -> Tensor:
     """Matrices (..., 3, 3) from checked rotations of either form, (B, J - 1, 3) or (B, J - 1, 3, 3)."""
     return axis_angle_to_matrix(rotations) if rotations.ndim == 3 else rotations
-
-
-def _common_batch(identities: int, poses: int) -> int:
-    if identities == poses or poses == 1:
-        return identities
-    if identities == 1:
-        return poses
-    raise InputError(
-        "rotations",
-        got=f"a batch of {poses} for {identities} identities",
-        expected=f"a batch of {identities} or 1",
-        fix="Give one pose an identity, one pose for all, or one identity for all poses.",
-    )

@@ -46,10 +46,10 @@ class FusedPose(torch.nn.Module):
         second = None if correctives is None else correctives.second.scipy()
         weights = posing.posed_skinning.weights.scipy()
         self.helper_count = 0 if twist is None else len(twist.start)
-        self.activation_count = 0 if correctives is None else correctives.first.shape[0]
-        ints, reals = _body_tables(posing, twist, correctives)
+        ints, reals = _body_tables(posing, twist, correctives, raw=not by_patches)
         self.register_buffer("ints", torch.as_tensor(ints).to(device, torch.int32), persistent=False)
         self.register_buffer("reals", torch.as_tensor(reals).to(device, dtype), persistent=False)
+        self.active_count = int(ints[3])
         self.patches: Patches | None = None
         channels = 0 if twist is None else len(twist.joint)
         self.fits = max(posing.kinematics.joint_count, channels) <= JOINT_LIMIT
@@ -57,10 +57,16 @@ class FusedPose(torch.nn.Module):
             self.patches = Patches(weights, second, dtype=dtype, device=device)
             self.fits = self.fits and self.patches.fits
             return
-        from soma_core.kernels.body_skin_wp import blend_of
+        from soma_core.kernels.body_skin_wp import Added, blend_of
 
         self.skin = blend_of(weights, dtype=dtype)
-        self.moves = None if second is None else blend_of(second, dtype=dtype, rows=3)
+        self.added: Added | None = None
+        if correctives is not None and second is not None:
+            first, moves = (
+                blend_of(correctives.first.scipy(), dtype=dtype),
+                blend_of(second, dtype=dtype, rows=3),
+            )
+            self.added = Added(first, moves, correctives.use_tanh)
 
     def forward(
         self,
@@ -87,7 +93,7 @@ class FusedPose(torch.nn.Module):
         if self.patches is None:
             from soma_core.kernels.body_skin_wp import skin_bodies
 
-            vertices = skin_bodies(identity.rest, skin, self.skin, active=active, moves=self.moves)
+            vertices = skin_bodies(identity.rest, skin, self.skin, features=active, added=self.added)
             return Posed(vertices=vertices, joints=joints, transforms=world)
         from soma_core.kernels.fused_pose_wp import skin_patches
 
@@ -129,7 +135,7 @@ class FusedPose(torch.nn.Module):
             stop = start + len(world)
             skin_bodies(
                 points.permute(2, 1, 0), skin, self.skin, before=before,
-                first=None if animation is None else animation.blend, active=active, moves=self.moves,
+                first=None if animation is None else animation.blend, features=active, added=self.added,
                 out=vertices[start:stop],
             )  # fmt: skip
             found.append((joints, world))
@@ -152,14 +158,14 @@ class FusedPose(torch.nn.Module):
 
         world, joints, skin, active = pose_bodies(
             rotations, translation, bind_world, bone_scale, self.ints, self.reals,
-            batch=len(translation), helpers=self.helper_count, activations=self.activation_count,
+            batch=len(translation), helpers=self.helper_count, activations=self.active_count,
             absolute=absolute,
         )  # fmt: skip
-        return world, joints, skin, active if self.activation_count else None
+        return world, joints, skin, active if self.active_count else None
 
 
 def _body_tables(
-    posing: Animation, twist: Twist | None, correctives: Correctives | None
+    posing: Animation, twist: Twist | None, correctives: Correctives | None, *, raw: bool
 ) -> tuple[np.ndarray, np.ndarray]:
     """Constants of the first kernel: integers, behind a header that says where each begins; numbers."""
     kinematics = posing.kinematics
@@ -177,9 +183,9 @@ def _body_tables(
     if twist is not None:
         channels = len(twist.joint)
         tables |= _twist_tables(twist)
-    activations, bounded = 0, False
+    activations, squash = 0, 0
     if correctives is not None:
-        activations, bounded = correctives.first.shape[0], correctives.use_tanh
+        activations, squash = correctives.first.shape[0], int(correctives.use_tanh)
         first = correctives.first.scipy()
         rows = np.concatenate((np.arange(activations), np.full(-activations % 32, -1)))
         start, ids, values = side_by_side(first.indptr.astype(np.int64), first.indices, first.data, rows)
@@ -191,8 +197,10 @@ def _body_tables(
             "first_value": values,
             "bone_length": np.array([correctives.length]),
         }
+        if raw:
+            activations, squash = 6 * kinematics.joint_count + 1, 2
     helpers = 0 if twist is None else len(twist.start)
-    counts = (kinematics.joint_count, helpers, channels, activations, len(sizes), int(bounded))
+    counts = (kinematics.joint_count, helpers, channels, activations, len(sizes), squash)
     header = len(counts) + len(BODY_INTS) + len(BODY_REALS)
     starts = [
         first + np.cumsum([0, *(tables[name].size for name in names)])[:-1]

@@ -53,7 +53,7 @@ def _pointers(names: Sequence[str], kind: str, base: str, header: int) -> str:
 def body_text() -> str:
     """Kinematics, twist joints, skinning transforms and activations of body `index`."""
     head = "const int* I = ints.data; const R* C = reals.data;\n"
-    head += "const int J = I[0], H = I[1], K = I[2], A = I[3], L = I[4], tanh_on = I[5];\n"
+    head += "const int J = I[0], H = I[1], K = I[2], A = I[3], L = I[4], squash = I[5];\n"
     tables = _pointers(BODY_INTS, "int", "I", 6) + "\n" + _pointers(BODY_REALS, "R", "C", 6 + len(BODY_INTS))
     steps = (THREADS, head, tables, _MEMORY, _LOAD, _WALK, _TRANSFORMS, _CHANNELS, _HELPERS, _ACTIVATIONS)
     return "\n".join(steps).replace("LIMIT", str(JOINT_LIMIT))
@@ -264,12 +264,16 @@ _ACTIVATIONS = """
     for (int e = 0; e < 8; e++) scale += part[e];
     scale = scale / bone_length[0];
     for (int a = lane; a < A; a += width) {
+        if (squash > 1) {  // what goes into the activations, and the size, for who makes them
+            active.data[(long long)index * A + a] = a < 6 * J ? feature[a] : scale;
+            continue;
+        }
         int s = a / 32, count = first_start[s + 1] - first_start[s];
         const int* id = first_id + first_start[s] + a % 32;
         const R* value = first_value + first_start[s] + a % 32;
         R sum = 0;
         for (int e = 0; e < count; e += 32) sum += value[e] * feature[id[e]];
         sum = sum > R(0) ? sum : R(0);
-        active.data[(long long)index * A + a] = scale * (tanh_on ? wp::tanh(sum) : sum);
+        active.data[(long long)index * A + a] = scale * (squash ? wp::tanh(sum) : sum);
     }
 """

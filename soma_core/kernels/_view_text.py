@@ -3,7 +3,7 @@
 Names are those of :func:`soma_core.kernels._solver_text.prelude`.
 """
 
-__all__ = ["ACTIVATE", "DOUBT", "KEEP", "PULL", "TRANSFORM", "TURN"]
+__all__ = ["ACTIVATE", "DOUBT", "KEEP", "PULL", "TANH", "TRANSFORM", "TURN"]
 
 TRANSFORM = """
     for (int j = 0; j < all_count; j++) {
@@ -16,7 +16,7 @@ TRANSFORM = """
 """
 """``G B^-1`` of every joint."""
 
-_TANH = """
+TANH = """
     #if defined(__clang__)
     auto tanh_of = [&](V x) {
         if (sizeof(R) == 8 || N == 1) {
@@ -43,7 +43,7 @@ _TANH = """
 """Hyperbolic tangent of what is not negative, by ``exp(-2 x) - 1`` with the argument near zero."""
 
 ACTIVATE = (
-    _TANH
+    TANH
     + """
     const int W = 3 * feature_columns;
     M to = feature;

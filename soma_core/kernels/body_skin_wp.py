@@ -15,8 +15,9 @@ from torch import Tensor
 from soma_core.kernels._lanes import as_rows, in_threads, launch, row_of, worker_count, working_rows
 from soma_core.kernels._native import native, transposing
 from soma_core.kernels._runtime import as_warp, scalar_name
+from soma_core.kernels._view_text import TANH
 
-__all__ = ["Blend", "blend_of", "skin_bodies"]
+__all__ = ["Added", "Blend", "blend_of", "skin_bodies"]
 
 _TILE = 64
 """Vertices treated together: their points stay in the first cache."""
@@ -39,6 +40,20 @@ class Blend(NamedTuple):
     start: Tensor
     column: Tensor
     value: Tensor
+
+
+class Added(NamedTuple):
+    """What correctives add.
+
+    Attributes:
+        first: weights (A, 6 J) of features.
+        moves: offsets (3 v, A) of activations, in rows of three.
+        squashed: whether activations are a hyperbolic tangent.
+    """
+
+    first: Blend
+    moves: Blend
+    squashed: bool
 
 
 def blend_of(matrix: scipy.sparse.csr_array, *, dtype: torch.dtype, rows: int = 1) -> Blend:
@@ -66,7 +81,9 @@ class _Task:
     vertices: int
     joints: int
     reposed: int
+    features: int
     activations: int
+    squashed: int
 
 
 @wp.struct
@@ -83,7 +100,7 @@ def _kernel(scalar: str, lanes: int):
     width, size = lanes, _TILE
     real, rows = wp.array(dtype=getattr(wp, scalar)), wp.array3d(dtype=getattr(wp, scalar))
     (load, store), row = transposing(scalar, lanes), row_of(scalar)
-    draw, move, skin = _steps(real, scalar, lanes)
+    draw, activate, move, skin = _steps(real, scalar, lanes)
     module = wp.get_module(f"soma_body_skin_{scalar}_{lanes}")
 
     @wp.kernel(module=module, enable_backward=False)
@@ -91,9 +108,10 @@ def _kernel(scalar: str, lanes: int):
         task: _Task, by: _Strides,
         skin_start: _ids, skin_joint: _short, skin_value: real,
         first_start: _ids, first_joint: _short, first_value: real,
+        active_start: _ids, active_id: _short, active_value: real,
         move_start: _ids, move_id: _short, move_value: real,
-        points: real, transforms: real, before: real, active: real,
-        turns: rows, firsts: rows, sources: rows, tiles: rows, out: real,
+        points: real, transforms: real, before: real, features: real,
+        turns: rows, firsts: rows, given: rows, sources: rows, tiles: rows, out: real,
     ):  # fmt: skip
         w = wp.tid()
         turn, first, source, tile = row(turns, w), row(firsts, w), row(sources, w), row(tiles, w)
@@ -103,7 +121,11 @@ def _kernel(scalar: str, lanes: int):
             f = g * width
             load(transforms, wp.int64(numbers), 0, numbers, f, last, turn, 0)
             load(before, wp.int64(own), 0, own, f, last, first, 0)
-            load(active, wp.int64(task.activations), 0, task.activations, f, last, source, 0)
+            load(features, wp.int64(task.features), 0, task.features, f, last, row(given, w), 0)
+            activate(
+                active_start, active_id, active_value, task.squashed, task.features, task.activations,
+                row(given, w), source,
+            )  # fmt: skip
             for t in range(task.first, task.stop):
                 a = t * size
                 b = wp.min(a + size, task.vertices)
@@ -128,13 +150,19 @@ def _steps(real, scalar: str, lanes: int):
     ):  # fmt: skip
         ...
 
+    def activate(
+        start: _ids, column: _short, value: real, squashed: int, features: int, count: int, given: real,
+        active: real,
+    ):  # fmt: skip
+        ...
+
     def move(start: _ids, column: _short, value: real, active: real, first: int, stop: int, tile: real): ...
 
     def skin(
         start: _ids, joint: _short, value: real, transforms: real, first: int, stop: int, tile: real
     ): ...
 
-    bodies = {draw: _DRAW, move: _MOVE, skin: _SKIN}
+    bodies = {draw: _DRAW, activate: _ACTIVATE, move: _MOVE, skin: _SKIN}
     for stub in bodies:
         stub.__name__ += "_bodies"
     return tuple(native(body, scalar, lanes, stub) for stub, body in bodies.items())
@@ -154,6 +182,20 @@ _DRAW = """
             }
         }
 """
+
+_ACTIVATE = (
+    "const V zero = V{}, one = zero + R(1);"
+    + TANH
+    + """
+    M x = (M)given.data, to = (M)active.data;
+    for (int a = 0; a < count; a++) {
+        V sum = zero;
+        for (int e = start.data[a]; e < start.data[a + 1]; e++) sum += value.data[e] * x[column.data[e]];
+        sum = sum > zero ? sum : zero;
+        to[a] = x[features - 1] * (squashed ? tanh_of(sum) : sum);
+    }
+"""
+)
 
 _MOVE = """
     M a = (M)active.data, x = (M)tile.data;
@@ -190,7 +232,7 @@ _SKIN = """
 
 def skin_bodies(
     points: Tensor, transforms: Tensor, skin: Blend, *, before: Tensor | None = None,
-    first: Blend | None = None, active: Tensor | None = None, moves: Blend | None = None,
+    first: Blend | None = None, features: Tensor | None = None, added: Added | None = None,
     out: Tensor | None = None,
 ) -> Tensor:  # fmt: skip
     """Skinned vertices (B, v, 3) [m], contiguous.
@@ -201,8 +243,8 @@ def skin_bodies(
         skin: weights (v, T).
         before: transforms (B, J, 3, 4) that take points to the bind pose first; None of what is there.
         first: weights (v, J) of these.
-        active: activations of the correctives (B, A), times the body's size; None without.
-        moves: offsets (3 v, A) of these, in rows of three.
+        features: of poses, and the bodies' size, (B, 6 J + 1); None without correctives.
+        added: what these make of them.
         out: where to write; None for new memory.
     """
     count, vertices = len(transforms), points.shape[1]
@@ -214,35 +256,39 @@ def skin_bodies(
     groups, threads = -(-count // lanes), torch.get_num_threads()
     shares = max(1, min(threads // groups, tiles))  # of the tiles, where there are more threads than groups
     kernel, none = _kernel(scalar_name(points.dtype), lanes), points.new_zeros(1)
-    blends = [skin, first or skin, moves or skin]
-    frames = [none if one is None else one.contiguous() for one in (transforms, before, active)]
+    blends = skin, first or skin, *((skin, skin) if added is None else added[:2])
+    frames = [none if one is None else one.contiguous() for one in (transforms, before, features)]
     strides = _Strides()
     strides.body, strides.vertex, strides.axis = points.stride()
     if len(points) == 1:
         strides.body = 0
-    sizes = 12 * transforms.shape[1], 12 * (0 if before is None else before.shape[1])
-    sizes += (0 if active is None else active.shape[1], 3 * _TILE)
+    joints, reposed = transforms.shape[1], 0 if before is None else before.shape[1]
+    seen, moving = (0, 0) if added is None or features is None else (features.shape[1], _rows(added.first))
+    sizes = 12 * joints, 12 * reposed, seen, moving, 3 * _TILE
 
     def run(part: slice) -> None:  # of more than one share, a part is one of them
         task, share = _Task(), part.start % shares
         task.begin, task.end = part.start // shares, -(-part.stop // shares)
         task.first, task.stop = tiles * share // shares, tiles * (share + 1) // shares
-        task.bodies, task.vertices, task.joints = count, vertices, transforms.shape[1]
-        task.reposed, task.activations = sizes[1] // 12, sizes[2]
+        task.bodies, task.vertices, task.joints, task.reposed = count, vertices, joints, reposed
+        task.features, task.activations, task.squashed = (
+            seen,
+            moving,
+            int(added is not None and added.squashed),
+        )
         workers = worker_count(task.end - task.begin, lanes)
         work = [working_rows(points, workers, max(size, 1), lanes) for size in sizes]
         tables = [as_warp(one) for blend in blends for one in blend]
         start = as_warp(points.as_strided((1,), (1,)))
-        given = [
-            start,
-            *(as_warp(one.view(-1)) for one in frames),
-            *map(as_rows, work),
-            as_warp(out.view(-1)),
-        ]
+        given = start, *(as_warp(one.view(-1)) for one in frames), *map(as_rows, work), as_warp(out.view(-1))
         launch(kernel, workers, [task, strides, *tables, *given], points)
 
     in_threads(run, groups * shares, points)
     return out
+
+
+def _rows(blend: Blend) -> int:
+    return len(blend.start) - 1
 
 
 def _lanes(count: int, like: Tensor) -> int:

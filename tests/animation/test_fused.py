@@ -242,7 +242,7 @@ def test_operators_are_registered_soundly(layer):
     fused, identity = twin.fused, twin.identity(shapes(layer, 2))
     rotations, translation = poses(layer, 2)
     given = (rotations, translation, identity.bind_world, None, fused.ints, fused.reals, 2)
-    given = (*given, fused.helper_count, fused.activation_count, False)
+    given = (*given, fused.helper_count, fused.active_count, False)
     torch.library.opcheck(torch.ops.soma_core.pose_bodies.default, given)
     _, _, skin, active = torch.ops.soma_core.pose_bodies(*given)
     tables = fused.patches
