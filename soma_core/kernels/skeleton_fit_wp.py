@@ -90,7 +90,7 @@ def _pull_back(
     """Kernel of the derivative of ``displace``: gradients of joints are added, those of covariances set."""
     vec3, mat33 = types.vec3, types.mat33
     kabsch_gradient, arc_gradient = _kabsch_gradient(types, module), _arc_gradient(types, module)
-    pair_gradient = _pair_gradient(types, module)
+    fan_gradient = _fan_gradient(types, module)
     positions, matrices = wp.array2d(dtype=vec3), wp.array2d(dtype=mat33)
 
     @wp.kernel(module=module, enable_backward=False)
@@ -119,14 +119,9 @@ def _pull_back(
                 c = wp.int32(children[p, e])
                 rest, reach = bind[c] - bind[k], joints[b, c] - joints[b, k]
                 bone = first * rest
-                bone_pull, reach_pull = wp.transpose(pull) * reach, pull * bone
-                for f in range(children.shape[1]):
-                    d = wp.int32(children[p, f])
-                    if d != c:
-                        other, far = first * (bind[d] - bind[k]), joints[b, d] - joints[b, k]
-                        of_bone, of_reach = pair_gradient(bone, other, reach, far, pull)
-                        bone_pull += of_bone
-                        reach_pull += of_reach
+                bone_pull, reach_pull = fan_gradient(b, p, k, c, children, bind, joints, first, pull)
+                bone_pull += wp.transpose(pull) * reach
+                reach_pull += pull * bone
                 first_pull += wp.outer(bone_pull, rest)
                 wp.atomic_add(joints_grad, b, c, reach_pull)  # zero for the padding
                 at_pivot -= reach_pull
@@ -226,6 +221,30 @@ def _pair_gradient(types: SimpleNamespace, module: wp.Module) -> wp.Function:
         return wp.cross(second, on_source), wp.cross(second_goal, on_goal)
 
     return pair_gradient
+
+
+def _fan_gradient(types: SimpleNamespace, module: wp.Module) -> wp.Function:
+    vec3, mat33 = types.vec3, types.mat33
+    pair_gradient = _pair_gradient(types, module)
+
+    @wp.func(module=module)
+    def fan_gradient(
+        b: int, p: int, k: int, c: int, children: _table, bind: wp.array(dtype=vec3),
+        joints: wp.array2d(dtype=vec3), first: mat33, pull: mat33,
+    ):  # fmt: skip
+        """Pulls on child c's turned bone and on its reach by a pull on the normals of its pairs."""
+        bone, reach = first * (bind[c] - bind[k]), joints[b, c] - joints[b, k]
+        bone_pull, reach_pull = vec3(), vec3()
+        for f in range(children.shape[1]):
+            d = wp.int32(children[p, f])
+            if d != c:
+                other, far = first * (bind[d] - bind[k]), joints[b, d] - joints[b, k]
+                of_bone, of_reach = pair_gradient(bone, other, reach, far, pull)
+                bone_pull += of_bone
+                reach_pull += of_reach
+        return bone_pull, reach_pull
+
+    return fan_gradient
 
 
 @torch.library.custom_op("soma_core::fit_displacements", mutates_args=())
