@@ -387,7 +387,7 @@ def _without_gaps(vertices: Tensor, weights: Tensor, layer: SomaLayer) -> tuple[
     Vertices of zero weight may be NaN or infinite; a frame with others is filled with the rig's bind shape.
     """
     finite = torch.isfinite(vertices.sum((1, 2)))
-    if vertices.device.type == "cpu" and bool(finite.all()):
+    if bool(finite.all()):
         return vertices, finite
     known = torch.isfinite(vertices).all(-1)
     whole = (known | (weights == 0)).all(1)
