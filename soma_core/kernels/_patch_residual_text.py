@@ -24,14 +24,13 @@ def patch_residual_text(frames: int, together: int) -> str:
 
 
 _HEAD = """
-    SOMA_SHARED Group pulled[3 * SLOTS * Q];
+    SOMA_SHARED Group pulled[3 * SLOTS * Q], lost[SLOTS * Q];
 #if defined(__CUDA_ARCH__)
-    static_assert(ACTIVATIONS >= 3 * SLOTS && JOINTS * 13 >= 4 * SLOTS, "no room for vertices");
+    static_assert(ACTIVATIONS >= 3 * SLOTS && JOINTS * 13 >= 3 * SLOTS, "no room for vertices");
     Group *rested = acts, *backs = parts;
 #else
-    Group rested[3 * SLOTS * Q], backs[4 * SLOTS * Q];
+    Group rested[3 * SLOTS * Q], backs[3 * SLOTS * Q];
 #endif
-    Group* lost = backs + 3 * SLOTS * Q;
     const int* run_patch = list_starts.data;
     const int* run_start = run_patch + patches + 1;
     const int* back_patch = run_start + run_patch[patches] + 1;
@@ -74,47 +73,62 @@ _SLOT = """
 """
 
 _RESIDUAL = """
-        R energy[G];
+        MEET;
+        Group* place = pulled + 3 * local;
         #pragma unroll
+        for (int q = 0; q < Q; q++) {
+            #pragma unroll
+            for (int r = 0; r < 3; r++) {
+                Group point, miss = place[q * 3 * SLOTS + r];
+                #pragma unroll
+                for (int p = 0; p < P; p++) {
+                    point.of[p] = x[q * P + p][r];
+                    miss.of[p] = y[q * P + p][r] - miss.of[p];
+                }
+                if (!live) continue;
+                rested[(q * SLOTS + local) * 3 + r] = point;
+                place[q * 3 * SLOTS + r] = miss;
+            }
+        }
+        #pragma unroll 1
         for (int g = 0; g < G; g++) {
             const long long b = first + g < last ? first + g : last;
-            Group* place = pulled + g / P * 3 * SLOTS + 3 * local;
-            R share = live ? weights.data[(@OWN_WEIGHTS ? b * vertices : 0) + vertex] : R(0), square = 0;
-            for (int r = 0; r < 3; r++) {
-                y[g][r] = live ? y[g][r] - place[r].of[g % P] : R(0);
-                square += y[g][r] * y[g][r];
-            }
-            if (@MEASURED && live && first + g <= last)
-                distances.data[b * vertices + vertex] = ROOT(square);
-            square = share > 0 ? square : R(0);
-            energy[g] = share * square;
+            R* miss = (R*)(place + g / P * 3 * SLOTS) + g % P;
+            R share = live ? weights.data[(@OWN_WEIGHTS ? b * vertices : 0) + vertex] : R(0);
+            const bool counts = share > 0;
+            R square = 0;
+            if (live) square = miss[0] * miss[0] + miss[P] * miss[P] + miss[2 * P] * miss[2 * P];
+            R far = @MEASURED || @CLIPPED ? ROOT(square) : R(0);
+            if (@MEASURED && live && first + g <= last) distances.data[b * vertices + vertex] = far;
+            R energy = share * (counts ? square : R(0));
             if (@CLIPPED) {
-                const R far = ROOT(square), limit = bound.data[b];
+                const R limit = bound.data[b];
+                far = counts ? far : R(0);
                 const R near = far < limit ? far : limit;
-                energy[g] = share * near * (far + far - near);
+                energy = share * near * (far + far - near);
                 share *= limit / (far > limit ? far : limit);
             }
-            for (int r = 0; r < 3; r++) {
-                y[g][r] = share > 0 ? share * y[g][r] : R(0);
-                if (live) place[r].of[g % P] = y[g][r];
-            }
-        }
-        MEET;
-        if (@PULLS && live) {
-            #pragma unroll
-            for (int q = 0; q < Q; q++)
-                for (int r = 0; r < 3; r++) {
-                    Group group;
-                    for (int p = 0; p < P; p++) group.of[p] = x[q * P + p][r];
-                    rested[(q * SLOTS + local) * 3 + r] = group;
-                }
+            ((R*)(lost + g / P * SLOTS + slot))[g % P] = energy;
+            if (live)
+                for (int r = 0; r < 3; r++) miss[r * P] = counts ? share * miss[r * P] : R(0);
         }
 """
+"""What is missed lies where the target was, then what it pulls; one frame at a time, which spares registers."""
 
 _BACK = """
         R back[G][3];
         #pragma unroll
-        for (int g = 0; g < G; g++) { back[g][0] = 0; back[g][1] = 0; back[g][2] = 0; }
+        for (int q = 0; q < Q; q++) {
+            #pragma unroll
+            for (int r = 0; r < 3; r++) {
+                const Group force = place[q * 3 * SLOTS + r];
+                #pragma unroll
+                for (int p = 0; p < P; p++) {
+                    y[q * P + p][r] = force.of[p];
+                    back[q * P + p][r] = 0;
+                }
+            }
+        }
         id = blend_id + blend_start[slice] + slot % 32;
         value = blend_value + blend_start[slice] + slot % 32;
         const int back_count = @PULLS && moved ? blend_count : 0;
@@ -140,11 +154,11 @@ _BACK = """
         MEET;
         #pragma unroll
         for (int q = 0; q < Q; q++) {
-            Group group;
-            for (int p = 0; p < P; p++) group.of[p] = energy[q * P + p];
-            lost[q * SLOTS + slot] = group;
             if (!live) continue;
+            #pragma unroll
             for (int r = 0; r < 3; r++) {
+                Group group;
+                #pragma unroll
                 for (int p = 0; p < P; p++) {
                     const int b = first + q * P + p < last ? first + q * P + p : last;
                     group.of[p] = scale.data[b] * back[q * P + p][r];

@@ -1,7 +1,5 @@
 """The residual by patches of the mesh: by the reference, on the CPU too, where its blocks are one thread."""
 
-import dataclasses
-
 import numpy as np
 import pytest
 import scipy.sparse
@@ -119,8 +117,10 @@ def test_the_real_mesh(lod, dtype, device):
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(ModelResidual, "forward", forward)
-        PoseInversion(layer, max_iterations=1)(layer.pose(identity, rotations).vertices, identity)
+        PoseInversion(layer, iterations=1)(layer.pose(identity, rotations).vertices, identity)
     run, given = next(one for one in asked if one[0].dtype == dtype)
+    given = list(given)  # targets a hand away, so that float32 has digits to compare
+    given[5] = given[5] + 0.1 * randn(*given[5].shape, seed=2, dtype=dtype).to(device)
     assert by_patches(run)
     skin, moves = (SparseRows(one, dtype=dtype, device=device) for one in run._matrices)
     other = ModelResidual(skin.csr, moves, dtype=dtype, device=device)
@@ -250,4 +250,3 @@ def test_an_inversion_finds_the_same_poses(monkeypatch):
         for one in (found, expected)
     ]
     assert float((errors[0] - errors[1]).abs().max()) < 5e-6
-    assert dataclasses.is_dataclass(found)
