@@ -77,6 +77,7 @@ _RESIDUAL = """
         Group* place = pulled + 3 * local;
         #pragma unroll
         for (int q = 0; q < Q; q++) {
+            if (!live) continue;
             #pragma unroll
             for (int r = 0; r < 3; r++) {
                 Group point, miss = place[q * 3 * SLOTS + r];
@@ -85,7 +86,6 @@ _RESIDUAL = """
                     point.of[p] = x[q * P + p][r];
                     miss.of[p] = y[q * P + p][r] - miss.of[p];
                 }
-                if (!live) continue;
                 rested[(q * SLOTS + local) * 3 + r] = point;
                 place[q * 3 * SLOTS + r] = miss;
             }
@@ -113,7 +113,7 @@ _RESIDUAL = """
                 for (int r = 0; r < 3; r++) miss[r * P] = counts ? share * miss[r * P] : R(0);
         }
 """
-"""What is missed lies where the target was, then what it pulls; one frame at a time, which spares registers."""
+"""Misses lie where targets did, then what they pull; one frame at a time, which spares registers."""
 
 _BACK = """
         R back[G][3];
@@ -121,7 +121,8 @@ _BACK = """
         for (int q = 0; q < Q; q++) {
             #pragma unroll
             for (int r = 0; r < 3; r++) {
-                const Group force = place[q * 3 * SLOTS + r];
+                Group force = {};
+                if (live) force = place[q * 3 * SLOTS + r];
                 #pragma unroll
                 for (int p = 0; p < P; p++) {
                     y[q * P + p][r] = force.of[p];
