@@ -18,6 +18,7 @@ import torch
 from torch import Tensor
 
 from soma_core.geometry.sparse import Csr, SparseRows, sparse_product
+from soma_core.kernels.residual_patches import ResidualPatches
 
 __all__ = ["ModelResidual", "Residual"]
 
@@ -77,7 +78,8 @@ class ModelResidual(torch.nn.Module):
         if correctives is not None:
             moves = correctives.scipy()
         self.vertex_count, self.activation_count, self.joint_count = vertices, moves.shape[1], joints
-        self._matrices, self._patches = (skin, moves), None
+        self._matrices = skin, moves
+        self._patches: ResidualPatches | None = None  # made when first asked for
         if warp:
             from soma_core.kernels.model_residual_wp import residual_tables
 
@@ -148,7 +150,6 @@ class ModelResidual(torch.nn.Module):
         targets = given[5]
         if _in_patches(targets):
             from soma_core.kernels.patch_residual_wp import residual_by_patches
-            from soma_core.kernels.residual_patches import ResidualPatches
 
             if self._patches is None:
                 self._patches = ResidualPatches(*self._matrices, dtype=self.dtype, device=targets.device)

@@ -72,6 +72,10 @@ class Patches(torch.nn.Module):
         bounds: first vertex of each patch, and the vertex count behind.
     """
 
+    ints: torch.Tensor
+    shorts: torch.Tensor
+    reals: torch.Tensor
+
     def __init__(
         self, weights: scipy.sparse.csr_array, second: scipy.sparse.csr_array | None, *,
         dtype: torch.dtype, device: torch.device | str,

@@ -38,6 +38,12 @@ class ResidualPatches(torch.nn.Module):
             list of a transform, then one for each activation of a patch.
     """
 
+    starts: torch.Tensor
+    vertices: torch.Tensor
+    values: torch.Tensor
+    items: torch.Tensor
+    cells: torch.Tensor
+
     def __init__(
         self, skin: scipy.sparse.csr_array, moves: scipy.sparse.csr_array, *, dtype: torch.dtype,
         device: torch.device | str,
