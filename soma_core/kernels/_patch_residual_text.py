@@ -24,11 +24,13 @@ def patch_residual_text(frames: int, together: int) -> str:
 
 
 _HEAD = """
-    SOMA_SHARED Group pulled[3 * SLOTS * Q], lost[SLOTS * Q];
+    SOMA_SHARED Group pulled[3 * SLOTS * Q];
 #if defined(__CUDA_ARCH__)
     static_assert(ACTIVATIONS >= 3 * SLOTS && JOINTS * 13 >= 3 * SLOTS, "no room for vertices");
     Group *rested = acts, *backs = parts;
+    __shared__ R lost[SLOTS / 32 * G];
 #else
+    R lost[SLOTS / 32 * G] = {};
     Group rested[3 * SLOTS * Q], backs[3 * SLOTS * Q];
 #endif
     const int* run_patch = list_starts.data;
@@ -108,12 +110,20 @@ _RESIDUAL = """
                 energy = share * near * (far + far - near);
                 share *= limit / (far > limit ? far : limit);
             }
-            ((R*)(lost + g / P * SLOTS + slot))[g % P] = energy;
+#if defined(__CUDA_ARCH__)
+            for (int apart = 16; apart > 0; apart /= 2) energy += __shfl_xor_sync(~0u, energy, apart);
+            if (lane % 32 == 0) lost[lane / 32 * G + g] = energy;
+#else
+            lost[slot / 32 * G + g] += energy;
+#endif
             if (live)
                 for (int r = 0; r < 3; r++) miss[r * P] = counts ? share * miss[r * P] : R(0);
         }
 """
-"""Misses lie where targets did, then what they pull; one frame at a time, which spares registers."""
+"""Misses lie where targets did, then what they pull; one frame at a time, which spares registers.
+
+The energies of a warp are added up on the way: no branch parts its threads here.
+"""
 
 _BACK = """
         R back[G][3];
@@ -228,18 +238,9 @@ _PULL = """
 """
 
 _ENERGY = """
-    constexpr int PARTS = 16;
-    for (int e = lane; e < PARTS * G; e += width) {
-        R* row = (R*)(lost + e % G / P * SLOTS + e / G) + e % P;
-        R sum = row[0];
-        for (int i = PARTS; i < SLOTS; i += PARTS) sum += row[i * P];
-        row[0] = sum;
-    }
-    MEET;
     for (int g = lane; g < G; g += width) {
-        const R* row = (const R*)(lost + g / P * SLOTS) + g % P;
         R sum = 0;
-        for (int i = 0; i < PARTS; i++) sum += row[i * P];
+        for (int i = 0; i < SLOTS / 32; i++) sum += lost[i * G + g];
         cell[patch * G + g] = sum;
     }
 """

@@ -26,6 +26,8 @@ _GROUP = {"float32": 8, "float64": 4}
 """Frames that share one reading of the weights; as many bytes in shared memory in both precisions."""
 _WORDS = {"float32": 4, "float64": 2}
 """Numbers that a thread loads from shared memory at once, 16 bytes."""
+_BLOCKS = 5
+"""Blocks that a multiprocessor holds: as many as fit its shared memory; registers are rationed for it."""
 _SCRATCH = 2**28
 """Bytes of the patches' sums of all frames that are treated in one launch."""
 
@@ -50,7 +52,9 @@ def _kernel(scalar: str, *, single: bool) -> wp.Kernel:
     residual = native(patch_residual_text(group, min(group, _WORDS[scalar])), scalar, 1, residual)
     module = wp.get_module(f"soma_patch_residual_{name}_{scalar}")
 
-    @wp.kernel(module=module, enable_backward=False, grid_stride=False)
+    bounds = PATCH_VERTICES, _BLOCKS
+
+    @wp.kernel(module=module, enable_backward=False, grid_stride=False, launch_bounds=bounds)
     def patch_residual(
         threads: int, batch: int, patches: int, vertices: int, transforms: int, activations: int, cells: int,
         flags: int, points: numbers, weights: numbers, skin: numbers, active: numbers, scale: numbers,
