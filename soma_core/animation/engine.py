@@ -9,11 +9,11 @@ import torch
 from torch import Tensor
 
 from soma_core.animation.kinematics import Kinematics, relative_from_absolute, to_homogeneous
-from soma_core.animation.patches import Patches
 from soma_core.animation.posed import Posed
 from soma_core.animation.skinning import Skinning, skinning_transforms
 from soma_core.animation.twist import Twist
 from soma_core.geometry.torch_func import transformed, untracked
+from soma_core.kernels.patches import Patches
 from soma_core.rig.skeleton import Rig
 from soma_core.skeleton.identity import Identity
 

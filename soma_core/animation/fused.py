@@ -9,11 +9,11 @@ import torch
 from torch import Tensor
 
 from soma_core.animation.engine import Animation, ProceduralAnimation
-from soma_core.animation.patches import Patches, side_by_side
 from soma_core.animation.posed import Posed
 from soma_core.animation.twist import Twist
 from soma_core.correctives.model import Correctives
 from soma_core.kernels._posing_text import BODY_INTS, BODY_REALS, JOINT_LIMIT
+from soma_core.kernels.patches import Patches, side_by_side
 from soma_core.skeleton.identity import Identity
 
 __all__ = ["FusedPose"]

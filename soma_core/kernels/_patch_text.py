@@ -2,25 +2,40 @@
 
 from soma_core.kernels._posing_text import THREADS
 
-__all__ = ["PATCH_ACTIVATIONS", "PATCH_JOINTS", "PATCH_VERTICES", "patch_text"]
+__all__ = [
+    "PATCH_ACTIVATIONS",
+    "PATCH_BLENDED",
+    "PATCH_JOINTS",
+    "PATCH_LOAD",
+    "PATCH_MOVED",
+    "PATCH_VERTICES",
+    "patch_head",
+    "patch_text",
+]
 
 PATCH_VERTICES, PATCH_JOINTS, PATCH_ACTIVATIONS = 128, 40, 448
 """Most vertices of a patch, transforms that they lie on, and activations that move them."""
 
 
-def patch_text(bodies: int, together: int) -> str:
-    """Skin of one patch of the mesh on `bodies` bodies, whose numbers are loaded `together` at a time."""
+def patch_head(bodies: int, together: int) -> str:
+    """Sizes, threads, and where the tables of a patch begin."""
     sizes = (
         f"constexpr int G = {bodies}, P = {together}, Q = G / P, SLOTS = {PATCH_VERTICES}, "
         f"ACTIVATIONS = {PATCH_ACTIVATIONS}, JOINTS = {PATCH_JOINTS};\n"
     )
-    return THREADS + sizes + _PATCH
+    return THREADS + sizes + _TABLES
 
 
-_PATCH = """
+def patch_text(bodies: int, together: int) -> str:
+    """Skin of one patch of the mesh on `bodies` bodies, whose numbers are loaded `together` at a time."""
+    staged = "SOMA_SHARED R staged[G * SLOTS * 3];\n"
+    steps = staged, PATCH_LOAD.replace("FACTOR", ""), _LOOP, PATCH_MOVED, PATCH_BLENDED, _OUT
+    return patch_head(bodies, together) + "".join(steps)
+
+
+_TABLES = """
     struct alignas(P * sizeof(R) < 16 ? P * sizeof(R) : 16) Group { R of[P]; };
     SOMA_SHARED Group acts[ACTIVATIONS * Q], parts[JOINTS * 13 * Q];
-    SOMA_SHARED R staged[G * SLOTS * 3];
     const int patch = index % patches, first = index / patches * G, last = batch - 1;
     const int* vertex_start = ints.data;
     const int* act_start = vertex_start + patches + 1;
@@ -34,6 +49,10 @@ _PATCH = """
     const short* blend_id = move_id + move_start[patches * (SLOTS / 32)];
     const R* move_value = reals.data;
     const R* blend_value = move_value + 3 * (long long)move_start[patches * (SLOTS / 32)];
+"""
+"""Shared memory and tables of a patch: ``index`` counts groups of ``G`` bodies, and patches within them."""
+
+PATCH_LOAD = """
     const int act_count = moved ? act_start[patch + 1] - act_start[patch] : 0;
     for (int e = lane; e < act_count; e += width) {
         int id = acts_used[act_start[patch] + e];
@@ -43,7 +62,7 @@ _PATCH = """
             #pragma unroll
             for (int p = 0; p < P; p++) {
                 int b = first + q * P + p;
-                group.of[p] = active.data[(long long)(b < last ? b : last) * activations + id];
+                group.of[p] = active.data[(long long)(b < last ? b : last) * activations + id]FACTOR;
             }
             acts[q * ACTIVATIONS + e] = group;
         }
@@ -62,12 +81,20 @@ _PATCH = """
             parts[(q * JOINTS + e / 12) * 13 + e % 12] = group;
         }
     }
+"""
+"""Activations, times ``FACTOR``, and transforms of the group into shared memory."""
+
+_LOOP = """
     MEET;
     for (int slot = lane; slot < SLOTS; slot += width) {
         const int local = slots[patch * SLOTS + slot], slice = patch * (SLOTS / 32) + slot / 32;
         if (local < 0) continue;
+        const int vertex = vertex_start[patch] + local;
+"""
+
+PATCH_MOVED = """
         R x[G][3], y[G][3];
-        const R* rest = points.data + (long long)(vertex_start[patch] + local) * vertex_stride;
+        const R* rest = points.data + (long long)vertex * vertex_stride;
         if (body_stride == 0) {
             R one[3] = {rest[0], rest[axis_stride], rest[2 * axis_stride]};
             #pragma unroll
@@ -96,6 +123,10 @@ _PATCH = """
                 }
             }
         }
+"""
+"""What a thread does for one slot: rest points ``x`` of all bodies, moved by the correctives."""
+
+PATCH_BLENDED = """
         #pragma unroll
         for (int g = 0; g < G; g++) { y[g][0] = 0; y[g][1] = 0; y[g][2] = 0; }
         const int blend_count = blend_start[slice + 1] - blend_start[slice];
@@ -119,6 +150,10 @@ _PATCH = """
                 }
             }
         }
+"""
+"""Then ``y``, the points on the skin."""
+
+_OUT = """
         #pragma unroll
         for (int g = 0; g < G; g++)
             for (int r = 0; r < 3; r++) staged[(g * SLOTS + local) * 3 + r] = y[g][r];

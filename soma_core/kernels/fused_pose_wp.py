@@ -221,7 +221,7 @@ def skin_patches(
         points: (B or 1, v, 3) rest shapes [m], with any strides.
         skin: (B, T, 3, 4) skinning transforms.
         active: (B, A) activations of the correctives, or None to leave them out.
-        ints, shorts, reals: tables from ``animation.patches``.
+        ints, shorts, reals: tables from ``kernels.patches``.
         patches: number of patches of the mesh.
     """
     return _skin_patches(points, skin, active, ints, shorts, reals, patches)

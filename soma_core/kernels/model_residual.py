@@ -18,11 +18,17 @@ import torch
 from torch import Tensor
 
 from soma_core.geometry.sparse import Csr, SparseRows, sparse_product
+from soma_core.kernels.residual_patches import ResidualPatches
 
 __all__ = ["ModelResidual", "Residual"]
 
 _FRAMES = 32
 """Frames that the reference treats at a time, so that they stay in cache."""
+
+
+def _in_patches(tensor: Tensor) -> bool:
+    """Whether the twin goes patch by patch of the mesh where it can, instead of frame by frame."""
+    return tensor.is_cuda
 
 
 class Residual(NamedTuple):
@@ -72,6 +78,8 @@ class ModelResidual(torch.nn.Module):
         if correctives is not None:
             moves = correctives.scipy()
         self.vertex_count, self.activation_count, self.joint_count = vertices, moves.shape[1], joints
+        self._matrices = skin, moves
+        self._patches: ResidualPatches | None = None  # made when first asked for
         if warp:
             from soma_core.kernels.model_residual_wp import residual_tables
 
@@ -126,10 +134,7 @@ class ModelResidual(torch.nn.Module):
         given = rest, weights, transforms, activations, scale, targets, origin, bound
         assert {one.dtype for one in given if one is not None} == {self.dtype}, self.dtype
         if self.warp:
-            from soma_core.kernels.model_residual_wp import residual_sums
-
-            tables = {name: self.get_buffer(name) for name in self._names}
-            found = residual_sums(tables, *given, gradient=gradient, distances=distances)
+            found = self._by_warp(given, gradient=gradient, distances=distances)
         else:
             found = self._by_torch(*given)
         energy, forces, pull, lengths = found
@@ -139,6 +144,21 @@ class ModelResidual(torch.nn.Module):
             pull=pull if gradient and self.activation_count else None,
             distances=lengths if distances else None,
         )
+
+    def _by_warp(self, given, *, gradient: bool, distances: bool):
+        """Energy, forces, pull and distances of all frames, by the kernels that suit the device."""
+        targets = given[5]
+        if _in_patches(targets):
+            from soma_core.kernels.patch_residual_wp import residual_by_patches
+
+            if self._patches is None:
+                self._patches = ResidualPatches(*self._matrices, dtype=self.dtype, device=targets.device)
+            if self._patches.fits:
+                return residual_by_patches(self._patches, *given, gradient=gradient, distances=distances)
+        from soma_core.kernels.model_residual_wp import residual_sums
+
+        tables = {name: self.get_buffer(name) for name in self._names}
+        return residual_sums(tables, *given, gradient=gradient, distances=distances)
 
     def _by_torch(self, rest, weights, transforms, activations, scale, targets, origin, bound):
         """Energy, forces, pull and distances of all frames."""

@@ -8,8 +8,8 @@ import torch
 from soma_core.animation import fused as fused_module
 from soma_core.animation.engine import ProceduralAnimation
 from soma_core.animation.fused import FusedPose
-from soma_core.animation.patches import Patches, side_by_side
 from soma_core.animation.posed import Posed
+from soma_core.kernels.patches import Patches, side_by_side
 from soma_core.layer import SomaLayer
 from soma_core.rig import load_canonical
 from tests.animation.test_twist import ALIGNED, EULER, SWING, with_modes

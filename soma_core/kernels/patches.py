@@ -16,7 +16,7 @@ import torch
 
 from soma_core.kernels._patch_text import PATCH_ACTIVATIONS, PATCH_JOINTS, PATCH_VERTICES
 
-__all__ = ["Patches", "side_by_side"]
+__all__ = ["Patches", "side_by_side", "triples"]
 
 _SLICE = 32
 
@@ -48,7 +48,7 @@ def side_by_side(
     return slice_start, out_ids, out_values
 
 
-def _triples(matrix: scipy.sparse.csr_array) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def triples(matrix: scipy.sparse.csr_array) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """CSR of (3 v, A) with x, y and z of each vertex together: starts (v + 1,), ids (e,), values (e, 3)."""
     entries = matrix.tocoo()
     vertex, axis = np.divmod(entries.row.astype(np.int64), 3)
@@ -69,7 +69,12 @@ class Patches(torch.nn.Module):
     Attributes:
         fits: whether every vertex's transforms and activations fit into a patch; if not, there are none.
         count: number of patches.
+        bounds: first vertex of each patch, and the vertex count behind.
     """
+
+    ints: torch.Tensor
+    shorts: torch.Tensor
+    reals: torch.Tensor
 
     def __init__(
         self, weights: scipy.sparse.csr_array, second: scipy.sparse.csr_array | None, *,
@@ -78,13 +83,13 @@ class Patches(torch.nn.Module):
         super().__init__()
         weights = weights.tocsr().sorted_indices()
         empty = np.zeros(weights.shape[0] + 1, np.int64), np.empty(0, np.int64), np.empty((0, 3))
-        moves = empty if second is None else _triples(second)
+        moves = empty if second is None else triples(second)
         blends = weights.indptr.astype(np.int64), weights.indices.astype(np.int64), weights.data
         bounds = _bounds(blends, moves)
         self.fits, self.count = bounds is not None, 0
         if bounds is None:
             return
-        self.count = len(bounds) - 1
+        self.count, self.bounds = len(bounds) - 1, bounds
         ints, shorts, reals = _tables(bounds, blends, moves)
         for name, array, kind in (
             ("ints", ints, torch.int32),
