@@ -17,7 +17,7 @@ from soma_core.geometry.kabsch import rotation_from_covariance
 from soma_core.geometry.rotations import axis_angle_to_matrix
 from soma_core.inversion.moments import SkinMoments
 from soma_core.inversion.structure import skin_structure
-from soma_core.kernels.model_residual import ModelResidual
+from soma_core.kernels import model_residual
 from soma_core.rig import load_canonical
 from soma_core.skeleton.fit import SkeletonFit
 from soma_core.skeleton.identity import Identity
@@ -234,16 +234,20 @@ def fit_twins(lod: str, count: int) -> Iterator[Twin]:
                inputs=(seen, rest[:1], bind[:1], weights[:1]), **bounds)  # fmt: skip
     yield Twin(name="frame moments", build=moments(each=True), inputs=(seen, rest, bind, weights), **bounds)
 
-    def residual(dtype: torch.dtype, device: torch.device, *, warp: bool) -> Function:
+    def residual(dtype: torch.dtype, device: torch.device, *, warp: bool, patches: bool) -> Function:
         skin = Skinning(rig.weights, dtype=dtype, device=device).weights
-        run = ModelResidual(skin.csr, None, warp=warp, dtype=dtype, device=device)
+        run = model_residual.ModelResidual(skin.csr, None, warp=warp, dtype=dtype, device=device)
 
         def made(rest: Tensor, weights: Tensor, moves: Tensor, seen: Tensor, origin: Tensor) -> Values:
+            usual, model_residual._in_patches = model_residual._in_patches, lambda _tensor: patches
             found = run(rest, weights, moves, None, None, seen, origin, distances=True)
+            model_residual._in_patches = usual
             return found.energy, found.forces, found.distances
 
         return made
 
     moves = 0.6 * randn(few, rig.joint_count, 3, 4, seed=6)
-    yield Twin(name="model residual", build=residual, relative=True, bounds=(1e-4, 1e-11),
-               inputs=(rest[:1], weights[:1], moves, seen, randn(few, 3, seed=7)))  # fmt: skip
+    for name, patches in (("model residual", False), ("residual by patches", True)):
+        yield Twin(name=name, build=functools.partial(residual, patches=patches), relative=True,
+                   bounds=(1e-4, 1e-11),
+                   inputs=(rest[:1], weights[:1], moves, seen, randn(few, 3, seed=7)))  # fmt: skip

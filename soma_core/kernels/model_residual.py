@@ -26,9 +26,13 @@ _FRAMES = 32
 """Frames that the reference treats at a time, so that they stay in cache."""
 
 
+_TRIED_ON_A_GPU = False
+"""Whether the kernel by patches has run on one: until then a GPU takes that of frames abreast, which has."""
+
+
 def _in_patches(tensor: Tensor) -> bool:
     """Whether the twin goes patch by patch of the mesh where it can, instead of frame by frame."""
-    return tensor.is_cuda
+    return tensor.is_cuda and _TRIED_ON_A_GPU
 
 
 class Residual(NamedTuple):
