@@ -141,7 +141,7 @@ class SomaLayer(Derived):
         )
         self.fused = fused if fused.fits else None
         self.animation.fuse(by_patches=by_patches)
-        self.rest_shape.fit.rotations.fused = by_patches
+        self.rest_shape.fit.rotations.fused = True
 
     def extra_repr(self) -> str:
         """What was chosen, for ``repr``."""

@@ -75,36 +75,43 @@ class Animation(torch.nn.Module):
         Returns:
             Planes (3, v, B) and world transforms (B, J, 4, 4) in the bind pose; the Hips stay in place.
         """
-        if self.patches is not None and untracked(points, fitted):
-            return self._repose_fused(self.patches, points, fitted)
         transforms, world = self.to_bind_pose(fitted)
-        if self.blend is not None and untracked(points, fitted):
+        if not untracked(points, fitted):
+            skinned = self._reposed(points, transforms)
+        elif self.patches is not None:
+            from soma_core.kernels.fused_pose_wp import skin_patches
+
+            tables = self.patches.ints, self.patches.shorts, self.patches.reals
+            rows = points.permute(2, 1, 0)
+            skinned = skin_patches(rows, transforms, None, *tables, patches=self.patches.count).permute(
+                2, 1, 0
+            )
+        elif self.blend is not None:
             from soma_core.kernels.body_skin_wp import skin_bodies
 
             skinned = skin_bodies(points.permute(2, 1, 0), transforms, self.blend).permute(2, 1, 0)
-        elif self.warp_skinning and not transformed():
-            skinned = _skin_warp(self.skinning, points.permute(2, 1, 0), transforms).permute(2, 1, 0)
         else:
-            skinned = self.skinning(points, transforms, rows=False)
+            skinned = self._reposed(points, transforms)
         return skinned, world
+
+    def _reposed(self, points: Tensor, transforms: Tensor) -> Tensor:
+        """Skinned planes, with their derivative."""
+        if self.warp_skinning and not transformed():
+            return _skin_warp(self.skinning, points.permute(2, 1, 0), transforms).permute(2, 1, 0)
+        return self.skinning(points, transforms, rows=False)
 
     def to_bind_pose(self, fitted: Tensor) -> tuple[Tensor, Tensor]:
         """What brings fitted bodies to the bind pose, (B, J, 3, 4), and transforms there, (B, J, 4, 4)."""
         kinematics = self.kinematics
+        if (self.patches is not None or self.blend is not None) and untracked(fitted):
+            from soma_core.kernels.identity_wp import to_bind_pose
+
+            constants = kinematics.bind_rotation, kinematics.parent_orient, kinematics.bind_parent_turn
+            world, transforms = to_bind_pose(fitted, kinematics.tree, *constants)
+            return transforms, world
         positions = kinematics.bind_positions(kinematics.local_offsets(fitted), fitted[:, 1, :3, 3])
         rotations = kinematics.bind_rotation.expand(len(fitted), -1, 3, 3)
         return skinning_transforms(rotations, positions, fitted), to_homogeneous(rotations, positions)
-
-    def _repose_fused(self, patches: Patches, points: Tensor, fitted: Tensor) -> tuple[Tensor, Tensor]:
-        from soma_core.kernels.fused_pose_wp import skin_patches
-        from soma_core.kernels.identity_wp import to_bind_pose
-
-        kinematics = self.kinematics
-        constants = kinematics.bind_rotation, kinematics.parent_orient, kinematics.bind_parent_turn
-        world, skin = to_bind_pose(fitted, kinematics.tree, *constants)
-        tables = patches.ints, patches.shorts, patches.reals
-        rest = skin_patches(points.permute(2, 1, 0), skin, None, *tables, patches=patches.count)
-        return rest.permute(2, 1, 0), world
 
     def bone_vectors(self, identity: Identity, bone_scale: Tensor | None = None) -> Tensor:
         """Bone vectors in T-pose world axes, (B, J, 3) [m], times `bone_scale` (1 or B, J - 1)."""
