@@ -13,6 +13,7 @@ world at T-pose, so that ``D_t`` is the joint's turn from the T-pose and no join
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -24,6 +25,9 @@ from soma_core.inversion.driven import DrivenRest
 from soma_core.inversion.structure import MomentStructure
 from soma_core.rig.skeleton import Rig
 from soma_core.skeleton.identity import Identity
+
+if TYPE_CHECKING:
+    from soma_core.kernels.patch_moments_wp import MomentPatches
 
 __all__ = ["RestMoments", "SkinMoments"]
 
@@ -59,6 +63,11 @@ class RestMoments:
         return len(self.second)
 
 
+def _in_patches(tensor: Tensor) -> bool:
+    """Whether the twin goes patch by patch of the mesh, instead of frame by frame."""
+    return tensor.is_cuda
+
+
 class SkinMoments(torch.nn.Module):
     """Computes ``N`` and ``R`` on the influences of one rig. Sums run in float64, in fixed order.
 
@@ -81,6 +90,7 @@ class SkinMoments(torch.nn.Module):
         super().__init__()
         self.dtype, self.joint_count, self.warp = dtype, len(structure.joints), warp
         self.vertex_count = len(structure.fitted)
+        self._patches: MomentPatches | None = None  # made when first asked for
         orient = rig.t_pose_world[structure.joints, :3, :3]
 
         def keep(name: str, array: np.ndarray) -> None:
@@ -168,10 +178,12 @@ class SkinMoments(torch.nn.Module):
         precise as one near it.
         """
         if self.warp and rest.batch_size == 1:
+            constants = rest.weight[0], rest.local[0], rest.own[0, :, 3].contiguous()
+            if _in_patches(vertices):
+                return self._target_by_patches(vertices, *constants)
             from soma_core.kernels.skin_moments_wp import target_moments
 
             runs = tuple(self.get_buffer(f"tile_runs_{i}") for i in range(4))
-            constants = rest.weight[0], rest.local[0], rest.own[0, :, 3].contiguous()
             return target_moments(self.joint_start, self.influence_vertex, runs, *constants, vertices)
         origin = vertices[:, self.influence_vertex[0]]
         near = vertices.double() - origin.double()[:, None]
@@ -179,6 +191,17 @@ class SkinMoments(torch.nn.Module):
             return self._one_target(near, rest, 0), origin
         frames = [self._one_target(near[f : f + 1], rest, f) for f in range(len(vertices))]
         return torch.cat(frames), origin
+
+    def _target_by_patches(
+        self, vertices: Tensor, weight: Tensor, local: Tensor, mean: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """``R`` and origins of one identity on a GPU."""
+        from soma_core.kernels.patch_moments_wp import MomentPatches, moments_by_patches
+
+        if self._patches is None:
+            starts, ids = (one.cpu().numpy() for one in (self.joint_start, self.influence_vertex))
+            self._patches = MomentPatches(starts, ids, device=vertices.device)
+        return moments_by_patches(self._patches, weight, local, mean, vertices)
 
     def of_vectors(self, vectors: Tensor, rest: RestMoments) -> Tensor:
         """``sum o w r (b; 1)^T`` (F, T, 3, 4) of vectors r (F, v, 3) [m] at the vertices of one identity."""

@@ -24,14 +24,15 @@ def patch_residual_text(frames: int, together: int) -> str:
 
 
 _HEAD = """
-    SOMA_SHARED Group pulled[3 * SLOTS * Q];
+    constexpr int PLANE = 3 * SLOTS + 1;  // frames of a vertex in banks side by side
+    SOMA_SHARED Group pulled[PLANE * Q];
 #if defined(__CUDA_ARCH__)
-    static_assert(ACTIVATIONS >= 3 * SLOTS && JOINTS * 13 >= 3 * SLOTS, "no room for vertices");
+    static_assert(ACTIVATIONS >= PLANE && JOINTS * 13 >= PLANE, "no room for vertices");
     Group *rested = acts, *backs = parts;
     __shared__ R lost[SLOTS / 32 * G];
 #else
     R lost[SLOTS / 32 * G] = {};
-    Group rested[3 * SLOTS * Q], backs[3 * SLOTS * Q];
+    Group rested[PLANE * Q], backs[PLANE * Q];
 #endif
     const int* run_patch = list_starts.data;
     const int* run_start = run_patch + patches + 1;
@@ -58,7 +59,7 @@ _TARGETS = """
                 group.of[p] = targets.data[3 * (b * vertices + vertex_start[patch]) + e]
                     - origin.data[3 * b + e % 3];
             }
-            pulled[q * 3 * SLOTS + e] = group;
+            pulled[q * PLANE + e] = group;
         }
     }
     MEET;
@@ -82,20 +83,20 @@ _RESIDUAL = """
             if (!live) continue;
             #pragma unroll
             for (int r = 0; r < 3; r++) {
-                Group point, miss = place[q * 3 * SLOTS + r];
+                Group point, miss = place[q * PLANE + r];
                 #pragma unroll
                 for (int p = 0; p < P; p++) {
                     point.of[p] = x[q * P + p][r];
                     miss.of[p] = y[q * P + p][r] - miss.of[p];
                 }
-                rested[(q * SLOTS + local) * 3 + r] = point;
-                place[q * 3 * SLOTS + r] = miss;
+                rested[q * PLANE + 3 * local + r] = point;
+                place[q * PLANE + r] = miss;
             }
         }
         #pragma unroll 1
         for (int g = 0; g < G; g++) {
             const long long b = first + g < last ? first + g : last;
-            R* miss = (R*)(place + g / P * 3 * SLOTS) + g % P;
+            R* miss = (R*)(place + g / P * PLANE) + g % P;
             R share = live ? weights.data[(@OWN_WEIGHTS ? b * vertices : 0) + vertex] : R(0);
             const bool counts = share > 0;
             R square = 0;
@@ -132,7 +133,7 @@ _BACK = """
             #pragma unroll
             for (int r = 0; r < 3; r++) {
                 Group force = {};
-                if (live) force = place[q * 3 * SLOTS + r];
+                if (live) force = place[q * PLANE + r];
                 #pragma unroll
                 for (int p = 0; p < P; p++) {
                     y[q * P + p][r] = force.of[p];
@@ -174,7 +175,7 @@ _BACK = """
                     const int b = first + q * P + p < last ? first + q * P + p : last;
                     group.of[p] = scale.data[b] * back[q * P + p][r];
                 }
-                backs[(q * SLOTS + local) * 3 + r] = group;
+                backs[q * PLANE + 3 * local + r] = group;
             }
         }
     }
@@ -185,7 +186,7 @@ _BACK = """
 _FORCES = """
     const int run_count = @PULLS ? run_patch[patch + 1] - run_patch[patch] : 0;
     for (int e = lane; e < run_count * G; e += width) {
-        const int run = run_patch[patch] + e / G, g = e % G, plane = g / P * 3 * SLOTS;
+        const int run = run_patch[patch] + e / G, g = e % G, plane = g / P * PLANE;
         const R* point = (const R*)(rested + plane) + g % P;
         const R* pull = (const R*)(pulled + plane) + g % P;
         R f[12] = {0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0};
@@ -221,7 +222,7 @@ _PULL = """
             const R wx = value[3 * i], wy = value[3 * i + 32], wz = value[3 * i + 64];
             #pragma unroll
             for (int q = 0; q < Q; q++) {
-                const Group bx = row[q * 3 * SLOTS], by = row[q * 3 * SLOTS + 1], bz = row[q * 3 * SLOTS + 2];
+                const Group bx = row[q * PLANE], by = row[q * PLANE + 1], bz = row[q * PLANE + 2];
                 #pragma unroll
                 for (int p = 0; p < P; p++)
                     sum[q * P + p] += wx * bx.of[p] + wy * by.of[p] + wz * bz.of[p];

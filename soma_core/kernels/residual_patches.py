@@ -16,7 +16,7 @@ import torch
 
 from soma_core.kernels.patches import Patches, side_by_side, triples
 
-__all__ = ["ResidualPatches"]
+__all__ = ["ResidualPatches", "joint_lists"]
 
 _LONGEST = 32
 """Vertices of one list of a transform."""
@@ -55,7 +55,8 @@ class ResidualPatches(torch.nn.Module):
         if not self.fits:
             return
         bounds = self.patches.bounds
-        runs = _joint_lists(bounds, skin)
+        vertex = np.repeat(np.arange(skin.shape[0]), np.diff(skin.indptr))
+        runs = joint_lists(bounds, vertex, skin.indices)
         pulls = _activation_lists(bounds, moves)
         count, rows = len(bounds) - 1, len(runs["joint"])
         self.cell_count = count + 12 * rows + len(pulls["activation"])
@@ -64,7 +65,7 @@ class ResidualPatches(torch.nn.Module):
         tables = {
             "starts": (starts, torch.int32),
             "vertices": (np.concatenate((runs["vertex"], pulls["vertex"])), torch.int16),
-            "values": (np.concatenate((runs["weight"], pulls["planes"])), dtype),
+            "values": (np.concatenate((skin.data[runs["entry"]], pulls["planes"])), dtype),
             "items": (items, torch.int32),
             "cells": (cells, torch.int32),
         }
@@ -85,11 +86,19 @@ def _flat(first: np.ndarray, length: np.ndarray) -> np.ndarray:
     return np.repeat(first - np.cumsum(length) + length, length) + np.arange(length.sum())
 
 
-def _joint_lists(bounds: np.ndarray, skin: scipy.sparse.csr_array) -> dict[str, np.ndarray]:
-    """Lists of transforms, the longest of a patch first, so that threads side by side walk alike ones."""
-    vertex = np.repeat(np.arange(skin.shape[0]), np.diff(skin.indptr))
+def joint_lists(bounds: np.ndarray, vertex: np.ndarray, joint: np.ndarray) -> dict[str, np.ndarray]:
+    """Lists of transforms, the longest of a patch first, so that threads side by side walk alike ones.
+
+    Args:
+        bounds: first vertex of each patch, and the vertex count behind.
+        vertex, joint: of each influence.
+
+    Returns:
+        ``patch_start``, first list of each patch; ``start`` of each list in what follows; ``entry``, the
+        influence, and ``vertex``, within its patch; ``joint`` of each list.
+    """
     home = np.repeat(np.arange(len(bounds) - 1), np.diff(bounds))[vertex]
-    order, first, length, patch, joint = _runs(home, skin.indices.astype(np.int64), skin.shape[1])
+    order, first, length, patch, joint = _runs(home, joint.astype(np.int64), int(joint.max(initial=0)) + 1)
     # A run is cut into pieces that differ by one vertex at most.
     pieces = -(-length // _LONGEST)
     run = np.repeat(np.arange(len(length)), pieces)
@@ -102,8 +111,8 @@ def _joint_lists(bounds: np.ndarray, skin: scipy.sparse.csr_array) -> dict[str, 
     return {
         "patch_start": np.searchsorted(patch, np.arange(len(bounds))),
         "start": np.concatenate(([0], np.cumsum(size))),
+        "entry": entry,
         "vertex": vertex[entry] - bounds[home[entry]],
-        "weight": skin.data[entry],
         "joint": joint,
     }
 
