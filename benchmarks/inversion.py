@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 from inputs import own_motion, own_rig_meshes
-from processes import Worker, medians_of_rounds
+from processes import Worker, rounds_of_turns
 
 __all__ = ["PEER_METHODS", "inversion_table", "run_inversion"]
 
@@ -39,13 +39,15 @@ def run_inversion(options: argparse.Namespace, folder: Path) -> tuple[dict, list
     for name, arrays in own_rig_meshes(options.frames, options.seed).items():
         files[name] = folder / f"{name}.npz"
         np.savez(files[name], **arrays)
-    ours = Worker("ours", [sys.executable, "ours.py", "inversion"])
+    threads = options.settings[-1]
+    ours = Worker("ours", [sys.executable, "ours.py", "inversion"], threads=threads)
     assets = str(folder / "assets")
-    peer = Worker("peer", [options.peer_python, "peers.py", "py-soma-x-inversion", assets])
+    peer = Worker("peer", [options.peer_python, "peers.py", "py-soma-x-inversion", assets], threads=threads)
     workers = [ours, peer]
     if options.earlier:
         command = [sys.executable, "ours.py", "inversion"]
-        workers.append(Worker("earlier", command, checkout=str(Path(options.earlier).absolute())))
+        checkout = str(Path(options.earlier).absolute())
+        workers.append(Worker("earlier", command, threads=threads, checkout=checkout))
     rows = []
     for case, file in files.items():
         for lod in LODS:
@@ -78,15 +80,15 @@ def _compare(
             raise SystemExit(f"{worker.name}, {method}: {rows[-1]['mean_mm']:.1f} mm on {case}; not timed")
     quick = [(f"{worker.name} {method}", worker, {"case": f"{lod}/{method}", "inputs": file})
              for worker, method in methods if method not in SLOW]  # fmt: skip
-    times = medians_of_rounds(quick, rounds=options.rounds, seconds=options.seconds, least=2)
+    times = rounds_of_turns(quick, rounds=options.rounds, seconds=options.seconds or 1.0, least=2)
     slow = [(f"peer {method}", peer, {"case": f"{lod}/{method}", "inputs": file}) for method in SLOW
             if method in options.peer_methods]  # fmt: skip
-    times |= medians_of_rounds(slow, rounds=1, seconds=0.0, least=1)
+    times |= rounds_of_turns(slow, rounds=1, seconds=0.0, least=1)
     for row in rows:
-        spent = times[f"{row['implementation']} {row['method']}"]
+        spent = times[f"{row['implementation']} {row['method']}"]["ms"]
         row["frames_per_second"] = 1e3 * options.frames / statistics.median(spent)
         for method in OURS:
-            pairs = zip(spent, times[f"ours {method}"], strict=False)
+            pairs = zip(spent, times[f"ours {method}"]["ms"], strict=False)
             row[f"ratio_to_{method}"] = statistics.median(theirs / ms for theirs, ms in pairs)
         sys.stderr.write(f"{row}\n")
     return rows
@@ -117,7 +119,7 @@ def inversion_table(results: dict) -> str:
     peaks = {row["implementation"]: row["peak_mb"] for row in results["rows"] if "peak_mb" in row}
     machine = results["machine"]
     lines += ["", f"Peak memory {peaks['ours']:.0f} MB against {peaks['peer']:.0f} MB.", "",
-              f"{machine['cpu']}, 2 threads, float32, medians of {machine['rounds']} alternating rounds; "
-              f"torch {machine['torch']}, py-soma-x {machine['peer']}, commit {machine['commit']}. "
-              "Written by `python benchmarks/run.py --only inversion`."]  # fmt: skip
+              f"{machine['cpu']}, {machine['threads']} threads, float32, medians of {machine['rounds']} "
+              f"alternating rounds; torch {machine['torch']}, py-soma-x {machine['peer']}, commit "
+              f"{machine['commit']}. Written by `python benchmarks/run.py --only inversion`."]  # fmt: skip
     return "\n".join(lines)

@@ -1,7 +1,7 @@
 """Worker: this project.
 
-python benchmarks/ours.py BACKEND [DEVICE]       the forward path
-python benchmarks/ours.py inversion [DEVICE]     pose inversion
+python benchmarks/ours.py BACKEND KIND THREADS [DEVICE]     the forward path
+python benchmarks/ours.py inversion THREADS [DEVICE]        pose inversion
 """
 
 from __future__ import annotations
@@ -17,36 +17,43 @@ from worker import Call, Work, serve
 
 from soma_core.layer import SomaLayer
 
-_SAME_WORK = {"procedural": False, "correctives": None}
-"""The peers skin by the 78 public joints: their template with twist joints is not in the package."""
+KINDS = {
+    "plain": {"procedural": False, "correctives": None},
+    "default": {},
+    "reference": {"kernels": "torch", "dtype": torch.float64},
+}
+"""``plain`` is the work of the peers, which skin by the 78 public joints: their template with twist joints is
+not in the package. ``default`` is the layer as it ships, and ``reference`` the same in double precision."""
 
 
-def main(backend: str, device: str = "cpu") -> None:
-    torch.set_num_threads(2)
+def main(backend: str, kind: str, threads: str, device: str = "cpu") -> None:
+    torch.set_num_threads(int(threads))
     begin = time.perf_counter()
-    layer = SomaLayer(backend, device=device, **_SAME_WORK)
+    layer = SomaLayer(backend, device=device, **KINDS[kind])
     construction = time.perf_counter() - begin
+
+    def tensor(array: np.ndarray) -> torch.Tensor:
+        return torch.from_numpy(array).to(device, layer.dtype)
 
     def params(inputs: dict[str, np.ndarray]) -> dict[str, torch.Tensor]:
         if backend == "soma":
-            return {"shape": torch.from_numpy(inputs["shape"]).to(device)}
-        values = torch.from_numpy(inputs["phenotypes"]).to(device)
+            return {"shape": tensor(inputs["shape"])}
+        values = tensor(inputs["phenotypes"])
         return {name: values[:, index].contiguous() for index, name in enumerate(PHENOTYPES)}
 
     def prepare(case: str, inputs: dict[str, np.ndarray]) -> Call:
-        poses, shift = (torch.from_numpy(inputs[name]).to(device) for name in ("poses", "translation"))
-        given = params(inputs)
+        poses, shift, given = tensor(inputs["poses"]), tensor(inputs["translation"]), params(inputs)
         if case == "forward":
             return torch.no_grad()(lambda: _waited(layer(given, poses, shift).vertices))
         if case == "pose":
             with torch.no_grad():
                 identity = layer.identity({name: value[:1] for name, value in given.items()})
             return torch.no_grad()(lambda: _waited(layer.pose(identity, poses, shift).vertices))
-        tracked = [tensor.requires_grad_() for tensor in (poses, shift, *given.values())]
+        tracked = [value.requires_grad_() for value in (poses, shift, *given.values())]
 
         def both() -> torch.Tensor:
-            for tensor in tracked:
-                tensor.grad = None
+            for value in tracked:
+                value.grad = None
             vertices = layer(given, poses, shift).vertices
             vertices.square().mean().backward()
             return _waited(vertices.detach())
@@ -65,13 +72,13 @@ def _waited(vertices: torch.Tensor) -> torch.Tensor:
     return vertices
 
 
-def main_inversion(device: str = "cpu") -> None:
+def main_inversion(threads: str, device: str = "cpu") -> None:
     from soma_core.inversion import PoseInversion
 
-    torch.set_num_threads(2)
+    torch.set_num_threads(int(threads))
     layers = {
-        (lod, kind): SomaLayer("anny", lod=lod, device=device, **options)
-        for lod in ("mid", "low") for kind, options in (("plain", _SAME_WORK), ("default", {}))
+        (lod, kind): SomaLayer("anny", lod=lod, device=device, **KINDS[kind])
+        for lod in ("mid", "low") for kind in ("plain", "default")
     }  # fmt: skip
 
     @torch.no_grad()

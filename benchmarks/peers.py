@@ -4,9 +4,9 @@
 layout, so that both run on the same rig, mesh and shape space.
 
     python benchmarks/peers.py build FOLDER          make the peer's assets (in this project's environment)
-    python benchmarks/peers.py py-soma-x FOLDER BACKEND      worker (in the peer's environment)
-    python benchmarks/peers.py py-soma-x-inversion FOLDER    worker: pose inversion (there too)
-    python benchmarks/peers.py anny                          worker: the anny package's own SOMA rig
+    python benchmarks/peers.py py-soma-x FOLDER BACKEND THREADS      worker (in the peer's environment)
+    python benchmarks/peers.py py-soma-x-inversion FOLDER THREADS    worker: pose inversion (there too)
+    python benchmarks/peers.py anny THREADS                          worker: the anny package's own SOMA rig
 """
 
 from __future__ import annotations
@@ -71,12 +71,12 @@ def build(folder: Path) -> None:
     shutil.copy(pair.wrap, folder / "Anny" / "SOMA_wrap.obj")
 
 
-def serve_py_soma_x(folder: str, backend: str) -> None:
+def serve_py_soma_x(folder: str, backend: str, threads: str) -> None:
     import torch
     from soma import SOMALayer
     from worker import serve
 
-    torch.set_num_threads(2)
+    torch.set_num_threads(int(threads))
     layer = SOMALayer(Path(folder), device="cpu", identity_model_type=backend, mode="warp")
     scales = {} if backend == "anny" else None
 
@@ -141,13 +141,13 @@ def _skeleton_transfer(inversion, vertices, parents: np.ndarray) -> dict:
     return {"rotations": local, "root_translation": world[:, 1, :3, 3]}
 
 
-def serve_py_soma_x_inversion(folder: str) -> None:
+def serve_py_soma_x_inversion(folder: str, threads: str) -> None:
     import torch
     from soma import SOMALayer
     from soma.pose_inversion import PoseInversion
     from worker import Work, serve
 
-    torch.set_num_threads(2)
+    torch.set_num_threads(int(threads))
     layer = SOMALayer(Path(folder), device="cpu", identity_model_type="anny", mode="warp")
     with np.load(Path(folder) / "SOMA_neutral.npz", allow_pickle=False) as file:
         low, parents = torch.from_numpy(file["lod_mid_to_low"]).long(), file["joint_parent_ids"]
@@ -184,12 +184,12 @@ def serve_py_soma_x_inversion(folder: str) -> None:
     serve(prepare, {"implementation": "py-soma-x", **versions})
 
 
-def serve_anny() -> None:
+def serve_anny(threads: str) -> None:
     import anny
     import torch
     from worker import serve
 
-    torch.set_num_threads(2)
+    torch.set_num_threads(int(threads))
     model = anny.Anny(rig="soma", topology="soma", phenotypes="all", pose_parameterization="local-ref")
     model = model.to(torch.float32)
 
@@ -222,6 +222,6 @@ if __name__ == "__main__":
     elif verb == "py-soma-x-inversion":
         serve_py_soma_x_inversion(*rest)
     elif verb == "anny":
-        serve_anny()
+        serve_anny(*rest)
     else:
         sys.exit(f"unknown verb {verb!r}; see the top of this file")

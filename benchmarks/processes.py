@@ -7,28 +7,32 @@ import os
 import platform
 import statistics
 import subprocess
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
-__all__ = ["HERE", "ROOT", "Worker", "cpu_name", "medians_of_rounds", "short_commit"]
+__all__ = ["HERE", "ROOT", "Worker", "cpu_name", "rounds_of_turns", "short_commit"]
 
 HERE = Path(__file__).resolve().parent
 ROOT = HERE.parent
+POOLS = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS")
 
 
 class Worker:
     """One implementation in a process of its own."""
 
-    def __init__(self, name: str, command: Sequence[str], *, checkout: str | None = None) -> None:
-        """Start it; with `checkout`, from the sources in that folder."""
+    def __init__(
+        self, name: str, command: Sequence[str], *, threads: int, checkout: str | None = None
+    ) -> None:
+        """Start it with `threads`, also its last argument; with `checkout`, from the sources there."""
         self.name = name
-        where = None
+        where = {**os.environ, **dict.fromkeys(POOLS, str(threads))}
         if checkout is not None:  # its plugins too
             sources = [checkout, *map(str, Path(checkout).glob("plugins/*"))]
-            where = {**os.environ, "PYTHONPATH": os.pathsep.join(sources)}
+            where["PYTHONPATH"] = os.pathsep.join(sources)
         self.process = subprocess.Popen(
-            command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, cwd=HERE, env=where
-        )
+            [*command, str(threads)], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, cwd=HERE,
+            env=where,
+        )  # fmt: skip
         self.versions = self._read()["versions"]
         self.peak_mb = 0.0
 
@@ -50,15 +54,26 @@ class Worker:
         self.process.wait()
 
 
-def medians_of_rounds(
-    turns: Sequence[tuple[str, Worker, dict]], *, rounds: int, seconds: float, least: int = 3
-) -> dict[str, list[float]]:
-    """Median milliseconds of each round, in which the turns (name, worker, request) follow each other."""
-    found: dict[str, list[float]] = {name: [] for name, _, _ in turns}
-    for _ in range(rounds):
+Found = dict[str, dict[str, list[float]]]
+
+
+def rounds_of_turns(
+    turns: Sequence[tuple[str, Worker, dict]], *, rounds: int, seconds: float, least: int = 3,
+    most: int = 0, settled: Callable[[Found], bool] = lambda _: True,
+) -> Found:  # fmt: skip
+    """Of each name, median ``ms`` and mean ``cpu_ms`` of a call in each round.
+
+    In a round the turns (name, worker, request) follow each other. There are `rounds`, and up to `most` until
+    what was found is `settled`.
+    """
+    found: Found = {name: {"ms": [], "cpu_ms": []} for name, _, _ in turns}
+    done = 0
+    while done < rounds or (done < most and not settled(found)):
         for name, worker, request in turns:
             reply = worker.ask(**request, seconds=seconds, least=least)
-            found[name].append(statistics.median(reply["times"]))
+            found[name]["ms"].append(statistics.median(reply["times"]))
+            found[name]["cpu_ms"].append(reply["cpu_ms"])
+        done += 1
     return found
 
 

@@ -5,126 +5,24 @@
     peer/bin/pip install py-soma-x==0.1.0 anny==0.6.2
     python benchmarks/run.py --peer-python peer/bin/python
 
-Writes ``forward_cpu.json`` and ``inversion_cpu.json`` in ``benchmarks/results``, and the tables in
-``benchmarks/README.md`` and ``README.md``.
+Writes ``forward_cpu.json`` and ``inversion_cpu.json`` in ``benchmarks/results``, the tables in
+``benchmarks/README.md``, and a short one in ``README.md``. Bars that are missed are said there.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+import os
 import re
-import statistics
 import subprocess
 import sys
 import tempfile
-from collections.abc import Sequence
 from pathlib import Path
 
-import numpy as np
-from inputs import forward_inputs
+from forward_cpu import forward_tables, run_forward, short_table
 from inversion import PEER_METHODS, inversion_table, run_inversion
-from processes import HERE, ROOT, Worker, cpu_name, medians_of_rounds, short_commit
-
-SAME_MM = {"soma": 5.0, "anny": 5.0}
-"""Largest mean distance to the peer [mm] at which the work counts as the same. Different frames of joints
-with several children, and our reposing to the bind pose, account for about one (see the experiment
-``anny_reference``)."""
-CASES = [("forward", 1), ("forward", 8), ("forward", 32), ("forward", 128), ("pose", 32), ("pose", 128),
-         ("forward_backward", 8)]  # fmt: skip
-BARS = {
-    ("soma", "forward", 32): 3, ("soma", "forward", 128): 3,
-    ("anny", "forward", 32): 5, ("anny", "forward", 128): 5,
-    ("soma", "pose", 32): 4, ("soma", "pose", 128): 4, ("anny", "pose", 32): 4, ("anny", "pose", 128): 4,
-    ("soma", "forward_backward", 8): 2, ("anny", "forward_backward", 8): 2,
-}  # fmt: skip
-
-
-def compare(ours: Worker, peer: Worker, inputs: str, folder: Path, *, limit_mm: float, hips: bool) -> float:
-    """Mean distance [mm] between the vertices of both; beyond the limit nothing is timed."""
-    bodies = []
-    for worker in (ours, peer):
-        path = str(folder / f"{worker.name}.npy")
-        worker.ask(case="forward", inputs=inputs, output=path)
-        bodies.append(np.load(path).astype(np.float64))
-    first, second = bodies
-    if hips:  # the anny package stands its root on the ground: compare shapes about their centres
-        first, second = (body - body.mean(1, keepdims=True) for body in bodies)
-    distance = 1e3 * float(np.linalg.norm(first - second, axis=-1).mean())
-    if not distance <= limit_mm:
-        raise SystemExit(
-            f"{ours.name} and {peer.name} are {distance:.1f} mm apart: not the same work, not timed"
-        )
-    return distance
-
-
-def run_backend(backend: str, options: argparse.Namespace, folder: Path, joint_names: Sequence[str]) -> dict:
-    files = {}
-    for batch in {batch for _, batch in CASES}:
-        files[batch] = str(folder / f"inputs_{batch}.npz")
-        np.savez(files[batch], **forward_inputs(joint_names, batch, options.seed))
-    here, peer_python = sys.executable, options.peer_python
-    ours = Worker("ours", [here, "ours.py", backend])
-    peer = Worker("peer", [peer_python, "peers.py", "py-soma-x", str(folder / "assets"), backend])
-    package = Worker("package", [here, "peers.py", "anny"]) if backend == "anny" else None
-    result = {
-        "versions": {worker.name: worker.versions for worker in (ours, peer, package) if worker},
-        "rows": [],
-    }
-    result["mean_distance_mm"] = compare(ours, peer, files[8], folder, limit_mm=SAME_MM[backend], hips=False)
-    if package:
-        result["mean_distance_to_package_mm"] = compare(
-            ours, package, files[8], folder, limit_mm=SAME_MM[backend], hips=True
-        )
-    for case, batch in CASES:
-        workers = [ours, peer] + ([package] if package and case == "forward" else [])
-        turns = [(worker.name, worker, {"case": case, "inputs": files[batch]}) for worker in workers]
-        times = medians_of_rounds(turns, rounds=options.rounds, seconds=options.seconds)
-        row = {
-            "case": case,
-            "batch": batch,
-            "ms": {name: statistics.median(values) for name, values in times.items()},
-        }
-        for name in times:
-            if name != "ours":
-                ratios = [theirs / mine for theirs, mine in zip(times[name], times["ours"], strict=True)]
-                row[f"ratio_to_{name}"] = statistics.median(ratios)
-        row["bar"] = BARS.get((backend, case, batch))
-        result["rows"].append(row)
-        sys.stderr.write(f"{backend} {json.dumps(row)}\n")
-    result["peak_mb"] = {worker.name: worker.peak_mb for worker in (ours, peer, package) if worker}
-    for worker in (ours, peer, package):
-        if worker:
-            worker.close()
-    return result
-
-
-def table(results: dict) -> str:
-    """The figures as markdown."""
-    lines = ["| backend | case | batch | ours, ms | py-soma-x, ms | ratio | bar | anny package, ms | ratio |",
-             "|---|---|---|---|---|---|---|---|---|"]  # fmt: skip
-    for backend, result in results["backends"].items():
-        for row in result["rows"]:
-            ms, package = row["ms"], row["ms"].get("package")
-            bar = f"{row['bar']}x" if row["bar"] else ""
-            last = f"{package:.1f} | {row['ratio_to_package']:.1f}x" if package else " | "
-            lines.append(
-                f"| {backend} | {row['case'].replace('_', ' + ')} | {row['batch']} | {ms['ours']:.1f} | "
-                f"{ms['peer']:.1f} | {row['ratio_to_peer']:.1f}x | {bar} | {last} |"
-            )
-    lines.append("")
-    for backend, result in results["backends"].items():
-        peak, versions = result["peak_mb"], result["versions"]
-        lines.append(
-            f"{backend}: peak memory {peak['ours']:.0f} MB against {peak['peer']:.0f} MB; construction "
-            f"{versions['ours']['construction_s']} s; "
-            f"mean distance of the two results {result['mean_distance_mm']:.2f} mm."
-        )
-    machine = results["machine"]
-    lines += ["", f"{machine['cpu']}, 2 threads, float32, medians of {machine['rounds']} alternating rounds; "
-              f"torch {machine['torch']}, py-soma-x {machine['peer']}, commit {machine['commit']}. "
-              "Written by `python benchmarks/run.py`."]  # fmt: skip
-    return "\n".join(lines)
+from processes import HERE, ROOT, cpu_name, short_commit
 
 
 def insert(path: Path, name: str, text: str) -> None:
@@ -137,29 +35,21 @@ def insert(path: Path, name: str, text: str) -> None:
     path.write_text(pattern.sub(lambda _: f"{begin}\n{text}\n{end}", old), encoding="utf-8")
 
 
-def store(name: str, mark: str, results: dict, text: str) -> None:
-    """Write the results and put their table into the texts that have a place for it."""
+def store(name: str, mark: str, results: dict, text: str, short: str = "") -> None:
+    """Write the results and put their table into both READMEs, `short` in the front one."""
     path = HERE / "results" / f"{name}.json"
     path.parent.mkdir(exist_ok=True)
     path.write_text(json.dumps(results, indent=1) + "\n", encoding="utf-8")
-    for file in (HERE / "README.md", ROOT / "README.md"):
-        insert(file, mark, text)
+    insert(HERE / "README.md", mark, text)
+    insert(ROOT / "README.md", mark, short or text)
     sys.stdout.write(text + "\n")
 
 
 def machine(options: argparse.Namespace, versions: dict) -> dict:
-    return {"cpu": cpu_name(), "rounds": options.rounds, "seed": options.seed,
-            "torch": versions["ours"]["torch"], "peer": versions["peer"]["py-soma-x"],
-            "commit": short_commit()}  # fmt: skip
-
-
-def run_forward(options: argparse.Namespace, folder: Path) -> None:
-    from soma_core.rig import load_canonical
-
-    names = load_canonical("mid")[1].user_joint_names
-    backends = {backend: run_backend(backend, options, folder, names) for backend in options.backends}
-    results = {"machine": machine(options, backends[options.backends[0]]["versions"]), "backends": backends}
-    store("forward_cpu", "benchmarks", results, table(results))
+    ours = versions.get("ours") or versions["plain"]
+    return {"cpu": cpu_name(), "rounds": options.rounds, "most_rounds": options.most_rounds,
+            "threads": options.settings[-1], "seed": options.seed, "torch": ours["torch"],
+            "peer": versions["peer"]["py-soma-x"], "commit": short_commit()}  # fmt: skip
 
 
 def main() -> None:
@@ -169,8 +59,12 @@ def main() -> None:
     parser.add_argument("--peer-python", required=True, help="interpreter with py-soma-x installed")
     parser.add_argument("--only", choices=["forward", "inversion"], help="one of the two benchmarks")
     parser.add_argument("--backends", nargs="+", default=["soma", "anny"], help="of the forward path")
-    parser.add_argument("--rounds", type=int, default=5)
-    parser.add_argument("--seconds", type=float, default=1.0, help="of each implementation in each round")
+    parser.add_argument("--threads", choices=["1", "all", "both"], default="both",
+                        help="of every implementation; inversion runs with the larger number")  # fmt: skip
+    parser.add_argument("--rounds", type=int, default=5, help="of the forward path, more until it settles")
+    parser.add_argument("--most-rounds", type=int, default=12, help="of the forward path")
+    parser.add_argument("--seconds", type=float, help="of each turn in each round (0.25; inversion 1)")
+    parser.add_argument("--quick", action="store_true", help="few rounds: whether all of it runs")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--frames", type=int, default=100, help="of each sequence that is inverted")
     parser.add_argument(
@@ -179,11 +73,18 @@ def main() -> None:
     parser.add_argument("--earlier", help="another checkout of ours, whose fits are timed beside")
     options = parser.parse_args()
     options.peer_python = str(Path(options.peer_python).absolute())
+    cores = len(os.sched_getaffinity(0))
+    options.settings = {"1": [1], "all": [cores], "both": sorted({1, cores})}[options.threads]
+    if options.quick:
+        vars(options).update(rounds=2, most_rounds=2, seconds=0.01, frames=10)
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         subprocess.run([sys.executable, "peers.py", "build", str(folder / "assets")], check=True, cwd=HERE)
         if options.only != "inversion":
-            run_forward(options, folder)
+            settings = run_forward(options, folder)
+            versions = settings[0]["backends"][options.backends[0]]["versions"]
+            results = {"machine": machine(options, versions), "settings": settings}
+            store("forward_cpu", "benchmarks", results, forward_tables(results), short_table(results))
         if options.only != "forward":
             versions, rows = run_inversion(options, folder)
             results = {"machine": machine(options, versions), "rows": rows}
