@@ -239,9 +239,9 @@ def fit_twins(lod: str, count: int) -> Iterator[Twin]:
         run = model_residual.ModelResidual(skin.csr, None, warp=warp, dtype=dtype, device=device)
 
         def made(rest: Tensor, weights: Tensor, moves: Tensor, seen: Tensor, origin: Tensor) -> Values:
-            usual, model_residual._in_patches = model_residual._in_patches, lambda _tensor: patches
+            usual, model_residual.in_patches = model_residual.in_patches, lambda _tensor: patches
             found = run(rest, weights, moves, None, None, seen, origin, distances=True)
-            model_residual._in_patches = usual
+            model_residual.in_patches = usual
             return found.energy, found.forces, found.distances
 
         return made

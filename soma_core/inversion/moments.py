@@ -23,6 +23,7 @@ from torch.nn.functional import embedding_bag
 from soma_core.geometry.sparse import sparse_product
 from soma_core.inversion.driven import DrivenRest
 from soma_core.inversion.structure import MomentStructure
+from soma_core.kernels.patches import in_patches
 from soma_core.rig.skeleton import Rig
 from soma_core.skeleton.identity import Identity
 
@@ -61,11 +62,6 @@ class RestMoments:
     def batch_size(self) -> int:
         """Number of identities."""
         return len(self.second)
-
-
-def _in_patches(tensor: Tensor) -> bool:
-    """Whether the twin goes patch by patch of the mesh, instead of frame by frame."""
-    return tensor.is_cuda
 
 
 class SkinMoments(torch.nn.Module):
@@ -179,7 +175,7 @@ class SkinMoments(torch.nn.Module):
         """
         if self.warp and rest.batch_size == 1:
             constants = rest.weight[0], rest.local[0], rest.own[0, :, 3].contiguous()
-            if _in_patches(vertices):
+            if in_patches(vertices):
                 return self._target_by_patches(vertices, *constants)
             from soma_core.kernels.skin_moments_wp import target_moments
 

@@ -18,21 +18,13 @@ import torch
 from torch import Tensor
 
 from soma_core.geometry.sparse import Csr, SparseRows, sparse_product
+from soma_core.kernels.patches import in_patches
 from soma_core.kernels.residual_patches import ResidualPatches
 
 __all__ = ["ModelResidual", "Residual"]
 
 _FRAMES = 32
 """Frames that the reference treats at a time, so that they stay in cache."""
-
-
-_TRIED_ON_A_GPU = False
-"""Whether the kernel by patches has run on one: until then a GPU takes that of frames abreast, which has."""
-
-
-def _in_patches(tensor: Tensor) -> bool:
-    """Whether the twin goes patch by patch of the mesh where it can, instead of frame by frame."""
-    return tensor.is_cuda and _TRIED_ON_A_GPU
 
 
 class Residual(NamedTuple):
@@ -152,7 +144,7 @@ class ModelResidual(torch.nn.Module):
     def _by_warp(self, given, *, gradient: bool, distances: bool):
         """Energy, forces, pull and distances of all frames, by the kernels that suit the device."""
         targets = given[5]
-        if _in_patches(targets):
+        if in_patches(targets):
             from soma_core.kernels.patch_residual_wp import residual_by_patches
 
             if self._patches is None:

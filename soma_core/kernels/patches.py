@@ -16,9 +16,17 @@ import torch
 
 from soma_core.kernels._patch_text import PATCH_ACTIVATIONS, PATCH_JOINTS, PATCH_VERTICES
 
-__all__ = ["Patches", "side_by_side", "triples"]
+__all__ = ["Patches", "in_patches", "side_by_side", "triples"]
 
 _SLICE = 32
+
+_FITS_TRIED_ON_A_GPU = False
+"""Whether a fit's kernels by patches have run on one; until then those of frames abreast, which have."""
+
+
+def in_patches(tensor: torch.Tensor) -> bool:
+    """Whether a fit goes patch by patch of the mesh, instead of frame by frame."""
+    return tensor.is_cuda and _FITS_TRIED_ON_A_GPU
 
 
 def side_by_side(

@@ -216,7 +216,7 @@ def test_nothing_is_read_from_the_host(monkeypatch):
     """On a device of shapes alone every value that is asked for raises, and what passes the host is noted.
 
     Fake CUDA tensors would say more, but a build of torch without CUDA refuses to take slices of them. A list
-    as index is not seen here; on a GPU, benchmarks/forward_gpu.py lets torch raise where the host waits.
+    as index is not seen here; on a GPU, torch.cuda.set_sync_debug_mode("error") raises where the host waits.
     """
     monkeypatch.setattr(torch, "is_autocast_enabled", lambda _kind: False)  # it knows no such device
     layer = SomaLayer("soma", lod="low")

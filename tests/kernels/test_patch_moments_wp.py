@@ -13,7 +13,7 @@ from tests.kernels.test_skin_moments_wp import BODY, assert_near, inputs, moment
 
 @pytest.fixture(autouse=True)
 def _patched(monkeypatch):
-    monkeypatch.setattr(moments_module, "_in_patches", lambda tensor: True)
+    monkeypatch.setattr(moments_module, "in_patches", lambda tensor: True)
 
 
 @pytest.mark.parametrize("device", DEVICES)

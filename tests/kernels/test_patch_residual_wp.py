@@ -29,7 +29,7 @@ BATCHES = [1, 7, 9, 33]
 
 @pytest.fixture(autouse=True)
 def _patched(monkeypatch):
-    monkeypatch.setattr(model_residual, "_in_patches", lambda tensor: True)
+    monkeypatch.setattr(model_residual, "in_patches", lambda tensor: True)
 
 
 def by_patches(run) -> bool:
@@ -242,7 +242,7 @@ def test_an_inversion_finds_the_same_poses(monkeypatch):
     identity = layer.identity()
     vertices = layer.pose(identity, 0.3 * randn(5, 77, 3, seed=1, dtype=torch.float32)).vertices
     found = PoseInversion(layer)(vertices, identity)
-    monkeypatch.setattr(model_residual, "_in_patches", lambda tensor: False)
+    monkeypatch.setattr(model_residual, "in_patches", lambda tensor: False)
     expected = PoseInversion(layer)(vertices, identity)
     errors = [
         (layer.pose(identity, one.rotations, one.translation).vertices - vertices).norm(dim=-1)
