@@ -139,8 +139,9 @@ class SomaLayer(Derived):
         fused = FusedPose(
             self.posing, self.correctives, dtype=self.dtype, device=self.device, by_patches=by_patches
         )
-        self.fused = fused if fused.fits else None
         self.animation.fuse(by_patches=by_patches)
+        fits = fused.fits and (self.animation.patches is not None or not by_patches)
+        self.fused = fused if fits else None
         self.rest_shape.fit.rotations.fused = True
 
     def extra_repr(self) -> str:
@@ -270,8 +271,14 @@ class SomaLayer(Derived):
         Takes and raises what :meth:`pose` does. Joints and their transforms are the same; the difference
         of the vertices is what twist joints and correctives add.
         """
-        _, relative, shift, scale, _ = self._body(identity, rotations, translation, bone_scale)
-        return self.animation.pose(identity, _matrices(relative), shift, absolute=absolute, bone_scale=scale)
+        body = self._body(identity, rotations, translation, bone_scale)
+        pose, more = self.animation.pose, {}
+        if self._fusible(*body[:4]):
+            assert self.fused is not None
+            pose, more = self.fused, {"plain": self.animation}
+        else:
+            body = body._replace(relative=_matrices(body.relative))
+        return pose(*body[:3], absolute=absolute, bone_scale=body.bone_scale, **more)
 
     def _fusible(
         self, identity: Identity, relative: Tensor, translation: Tensor, bone_scale: Tensor | None

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -15,6 +16,9 @@ from soma_core.correctives.model import Correctives
 from soma_core.kernels._posing_text import BODY_INTS, BODY_REALS, JOINT_LIMIT
 from soma_core.kernels.patches import Patches, side_by_side
 from soma_core.skeleton.identity import Identity
+
+if TYPE_CHECKING:
+    from soma_core.kernels.body_skin_wp import Added, Blend
 
 __all__ = ["FusedPose"]
 
@@ -51,6 +55,7 @@ class FusedPose(torch.nn.Module):
         self.register_buffer("reals", torch.as_tensor(reals).to(device, dtype), persistent=False)
         self.active_count = int(ints[3])
         self.patches: Patches | None = None
+        self.skin: Blend | None = None
         channels = 0 if twist is None else len(twist.joint)
         self.fits = max(posing.kinematics.joint_count, channels) <= JOINT_LIMIT
         if by_patches:
@@ -76,6 +81,7 @@ class FusedPose(torch.nn.Module):
         *,
         absolute: bool,
         bone_scale: Tensor | None = None,
+        plain: Animation | None = None,
     ) -> Posed:
         """Posed bodies; what is given is already checked.
 
@@ -86,21 +92,24 @@ class FusedPose(torch.nn.Module):
             translation: Hips positions (B, 3) [m]; B is the batch that comes out.
             absolute: `rotations` are local rotations of the rig's own axes.
             bone_scale: (1 or B, J - 1).
+            plain: skins by the public joints alone, and without correctives; None for all there is.
         """
         world, joints, skin, active = self._bodies(
             identity.bind_world, rotations, translation, absolute=absolute, bone_scale=bone_scale
         )
-        if self.patches is None:
+        blend, tables = self.skin, self.patches
+        if plain is not None:
+            skin, active, blend, tables = skin[:, : world.shape[1]], None, plain.blend, plain.patches
+        if tables is None:
             from soma_core.kernels.body_skin_wp import skin_bodies
 
-            vertices = skin_bodies(identity.rest, skin, self.skin, features=active, added=self.added)
-            return Posed(vertices=vertices, joints=joints, transforms=world)
-        from soma_core.kernels.fused_pose_wp import skin_patches
+            added = None if active is None else self.added
+            vertices = skin_bodies(identity.rest, skin, blend, features=active, added=added)
+        else:
+            from soma_core.kernels.fused_pose_wp import skin_patches
 
-        tables = self.patches
-        vertices = skin_patches(
-            identity.rest, skin, active, tables.ints, tables.shorts, tables.reals, patches=tables.count
-        )
+            named = tables.ints, tables.shorts, tables.reals
+            vertices = skin_patches(identity.rest, skin, active, *named, patches=tables.count)
         return Posed(vertices=vertices, joints=joints, transforms=world)
 
     def whole(

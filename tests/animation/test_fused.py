@@ -93,6 +93,20 @@ def test_equals_other_layers(options, device, by_patches):
     assert_same(got, plain({"shape": shape}, rotations, translation))
 
 
+@pytest.mark.parametrize(("device", "by_patches"), WAYS)
+@torch.no_grad()
+def test_plain_poses_have_the_same_joints(layer, device, by_patches):
+    twin = fast_twin(layer, device, by_patches=by_patches)
+    (rotations, translation), shape = poses(layer, 9), shapes(layer, 9)["shape"]
+    expected = layer.pose_plain(layer.identity({"shape": shape}), rotations, translation)
+    identity, given = twin.identity({"shape": shape.to(device)}), moved((rotations, translation), device)
+    plain, posed = twin.pose_plain(identity, *given), twin.pose(identity, *given)
+    assert_same(plain, expected)
+    assert torch.equal(plain.joints, posed.joints)
+    assert torch.equal(plain.transforms, posed.transforms)
+    assert (plain.vertices - posed.vertices).abs().max() > 1e-3
+
+
 @pytest.mark.parametrize("by_patches", [False, True])
 @pytest.mark.parametrize("lod", ["mid", "xlo"])
 @torch.no_grad()
