@@ -35,11 +35,20 @@ def insert(path: Path, name: str, text: str) -> None:
     path.write_text(pattern.sub(lambda _: f"{begin}\n{text}\n{end}", old), encoding="utf-8")
 
 
+def rounded(value: object) -> object:
+    """Results with numbers of four digits: what follows is noise."""
+    if isinstance(value, dict):
+        return {name: rounded(one) for name, one in value.items()}
+    if isinstance(value, list | tuple):
+        return [rounded(one) for one in value]
+    return float(f"{value:.4g}") if isinstance(value, float) else value
+
+
 def store(name: str, mark: str, results: dict, text: str, short: str = "") -> None:
     """Write the results and put their table into both READMEs, `short` in the front one."""
     path = HERE / "results" / f"{name}.json"
     path.parent.mkdir(exist_ok=True)
-    path.write_text(json.dumps(results, indent=1) + "\n", encoding="utf-8")
+    path.write_text(json.dumps(rounded(results), separators=(",", ":")) + "\n", encoding="utf-8")
     insert(HERE / "README.md", mark, text)
     insert(ROOT / "README.md", mark, short or text)
     sys.stdout.write(text + "\n")

@@ -76,34 +76,28 @@ class Animation(torch.nn.Module):
             Planes (3, v, B) and world transforms (B, J, 4, 4) in the bind pose; the Hips stay in place.
         """
         transforms, world = self.to_bind_pose(fitted)
-        if not untracked(points, fitted):
-            skinned = self._reposed(points, transforms)
-        elif self.patches is not None:
+        if (self.patches or self.blend) and untracked(points, fitted):
+            return self._skin_fused(points.permute(2, 1, 0), transforms).permute(2, 1, 0), world
+        if self.warp_skinning and not transformed():
+            return _skin_warp(self.skinning, points.permute(2, 1, 0), transforms).permute(2, 1, 0), world
+        return self.skinning(points, transforms, rows=False), world
+
+    def _skin_fused(self, points: Tensor, transforms: Tensor) -> Tensor:
+        """Skinned vertices (B, v, 3) by one kernel, without their derivative."""
+        if self.patches is not None:
             from soma_core.kernels.fused_pose_wp import skin_patches
 
             tables = self.patches.ints, self.patches.shorts, self.patches.reals
-            rows = points.permute(2, 1, 0)
-            skinned = skin_patches(rows, transforms, None, *tables, patches=self.patches.count).permute(
-                2, 1, 0
-            )
-        elif self.blend is not None:
-            from soma_core.kernels.body_skin_wp import skin_bodies
+            return skin_patches(points, transforms, None, *tables, patches=self.patches.count)
+        from soma_core.kernels.body_skin_wp import skin_bodies
 
-            skinned = skin_bodies(points.permute(2, 1, 0), transforms, self.blend).permute(2, 1, 0)
-        else:
-            skinned = self._reposed(points, transforms)
-        return skinned, world
-
-    def _reposed(self, points: Tensor, transforms: Tensor) -> Tensor:
-        """Skinned planes, with their derivative."""
-        if self.warp_skinning and not transformed():
-            return _skin_warp(self.skinning, points.permute(2, 1, 0), transforms).permute(2, 1, 0)
-        return self.skinning(points, transforms, rows=False)
+        assert self.blend is not None
+        return skin_bodies(points, transforms, self.blend)
 
     def to_bind_pose(self, fitted: Tensor) -> tuple[Tensor, Tensor]:
         """What brings fitted bodies to the bind pose, (B, J, 3, 4), and transforms there, (B, J, 4, 4)."""
         kinematics = self.kinematics
-        if (self.patches is not None or self.blend is not None) and untracked(fitted):
+        if (self.patches or self.blend) and untracked(fitted):
             from soma_core.kernels.identity_wp import to_bind_pose
 
             constants = kinematics.bind_rotation, kinematics.parent_orient, kinematics.bind_parent_turn

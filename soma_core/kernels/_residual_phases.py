@@ -10,7 +10,7 @@ import warp as wp
 
 from soma_core.kernels._native import native
 
-__all__ = ["TILE", "phases", "tile_slots"]
+__all__ = ["BLEND", "OFFSET", "TILE", "phases", "tile_slots"]
 
 TILE = 64
 """Vertices treated together, so that what they share is read from the first cache; also those whose energy
@@ -68,9 +68,33 @@ def phases(scalar: str, lanes: int) -> SimpleNamespace:
         name = stub.__name__
         for slot, at in _SLOTS.items():
             body = body.replace(f"@{slot}", f"((M)tile.data + {at})")
+        body = body.replace("BLEND\n", BLEND).replace("OFFSET\n", OFFSET)
         made[name] = native(body, scalar, lanes, stub)
     return SimpleNamespace(**made)
 
+
+BLEND = """
+        V m[12];
+        for (int k = 0; k < 12; k++) m[k] = V{};
+        for (int e = start.data[v]; e < start.data[v + 1]; e++) {
+            M t = transform + 12 * joint.data[e];
+            const R w = value.data[e];
+            for (int k = 0; k < 12; k++) m[k] += w * t[k];
+        }
+"""
+"""What moves vertex v: the transforms of its joints, blended."""
+
+OFFSET = """
+        V p = V{}, q = V{}, r = V{};
+        for (int e = start.data[v]; e < start.data[v + 1]; e++) {
+            const R* move = value.data + 3 * e;
+            const V b = a[activation.data[e]];
+            p += move[0] * b;
+            q += move[1] * b;
+            r += move[2] * b;
+        }
+"""
+"""What the activations add to vertex v."""
 
 _CLEAR = """
     M to = (M)out.data + at;
@@ -87,14 +111,7 @@ _MOVED = """
     const V scale = *@SCALE;
     M x = @POINT;
     for (int v = first; v < stop; v++, x += 3) {
-        V p = V{}, q = V{}, r = V{};
-        for (int e = start.data[v]; e < start.data[v + 1]; e++) {
-            const R* move = value.data + 3 * e;
-            const V b = a[activation.data[e]];
-            p += move[0] * b;
-            q += move[1] * b;
-            r += move[2] * b;
-        }
+        OFFSET
         x[0] += scale * p;
         x[1] += scale * q;
         x[2] += scale * r;
@@ -111,13 +128,7 @@ _RESIDUAL = """
             for (int i = 0; i < 3; i++) r[i] = back[i] = V{};
             continue;
         }
-        V m[12];
-        for (int k = 0; k < 12; k++) m[k] = V{};
-        for (int e = start.data[v]; e < start.data[v + 1]; e++) {
-            M t = transform + 12 * joint.data[e];
-            const R w = value.data[e];
-            for (int k = 0; k < 12; k++) m[k] += w * t[k];
-        }
+        BLEND
         V d[3], share = own ? *o : V{} + weight.data[v];
         for (int i = 0; i < 3; i++) {
             const V* row = m + 4 * i;

@@ -14,13 +14,11 @@ from torch import Tensor
 
 from soma_core.kernels._lanes import as_rows, in_threads, launch, row_of, worker_count, working_rows
 from soma_core.kernels._native import native, transposing
+from soma_core.kernels._residual_phases import BLEND, OFFSET, TILE
 from soma_core.kernels._runtime import as_warp, scalar_name
 from soma_core.kernels._view_text import TANH
 
 __all__ = ["Added", "Blend", "blend_of", "skin_bodies"]
-
-_TILE = 64
-"""Vertices treated together: their points stay in the first cache."""
 
 _WIDTHS = {torch.float32: (4, 8, 16), torch.float64: (4, 8)}
 """Bodies a thread may treat at once: SIMD registers of current CPUs, wide ones split where there are none."""
@@ -97,7 +95,7 @@ class _Strides:
 
 @functools.cache
 def _kernel(scalar: str, lanes: int):
-    width, size = lanes, _TILE
+    width, size = lanes, TILE
     real, rows = wp.array(dtype=getattr(wp, scalar)), wp.array3d(dtype=getattr(wp, scalar))
     (load, store), row = transposing(scalar, lanes), row_of(scalar)
     draw, activate, move, skin = _steps(real, scalar, lanes)
@@ -156,7 +154,9 @@ def _steps(real, scalar: str, lanes: int):
     ):  # fmt: skip
         ...
 
-    def move(start: _ids, column: _short, value: real, active: real, first: int, stop: int, tile: real): ...
+    def move(
+        start: _ids, activation: _short, value: real, active: real, first: int, stop: int, tile: real
+    ): ...
 
     def skin(
         start: _ids, joint: _short, value: real, transforms: real, first: int, stop: int, tile: real
@@ -197,37 +197,32 @@ _ACTIVATE = (
 """
 )
 
-_MOVE = """
+_MOVE = (
+    """
     M a = (M)active.data, x = (M)tile.data;
     for (int v = first; v < stop; v++, x += 3) {
-        V p = x[0], q = x[1], r = x[2];
-        for (int e = start.data[v]; e < start.data[v + 1]; e++) {
-            const R* by = value.data + 3 * e;
-            const V b = a[column.data[e]];
-            p += by[0] * b;
-            q += by[1] * b;
-            r += by[2] * b;
-        }
-        x[0] = p;
-        x[1] = q;
-        x[2] = r;
+"""
+    + OFFSET
+    + """
+        x[0] += p;
+        x[1] += q;
+        x[2] += r;
     }
 """
+)
 
-_SKIN = """
+_SKIN = (
+    """
     M transform = (M)transforms.data, x = (M)tile.data;
     for (int v = first; v < stop; v++, x += 3) {
-        V m[12];
-        for (int k = 0; k < 12; k++) m[k] = V{};
-        for (int e = start.data[v]; e < start.data[v + 1]; e++) {
-            M t = transform + 12 * joint.data[e];
-            const R w = value.data[e];
-            for (int k = 0; k < 12; k++) m[k] += w * t[k];
-        }
+"""
+    + BLEND
+    + """
         const V p = x[0], q = x[1], r = x[2];
         for (int i = 0; i < 3; i++) x[i] = m[4 * i] * p + m[4 * i + 1] * q + m[4 * i + 2] * r + m[4 * i + 3];
     }
 """
+)
 
 
 def skin_bodies(
@@ -252,7 +247,7 @@ def skin_bodies(
         out = points.new_empty(count, vertices, 3)
     if not out.numel():
         return out
-    lanes, tiles = _lanes(count, points), -(-vertices // _TILE)
+    lanes, tiles = _lanes(count, points), -(-vertices // TILE)
     groups, threads = -(-count // lanes), torch.get_num_threads()
     shares = max(1, min(threads // groups, tiles))  # of the tiles, where there are more threads than groups
     kernel, none = _kernel(scalar_name(points.dtype), lanes), points.new_zeros(1)
@@ -264,7 +259,7 @@ def skin_bodies(
         strides.body = 0
     joints, reposed = transforms.shape[1], 0 if before is None else before.shape[1]
     seen, moving = (0, 0) if added is None or features is None else (features.shape[1], _rows(added.first))
-    sizes = 12 * joints, 12 * reposed, seen, moving, 3 * _TILE
+    sizes = 12 * joints, 12 * reposed, seen, moving, 3 * TILE
 
     def run(part: slice) -> None:  # of more than one share, a part is one of them
         task, share = _Task(), part.start % shares

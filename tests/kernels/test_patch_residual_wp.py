@@ -18,6 +18,8 @@ from tests.kernels.test_model_residual_wp import (
     JOINTS,
     VERTICES,
     assert_near,
+    cases,
+    check_twin,
     inputs,
     matrices,
     model,
@@ -36,27 +38,9 @@ def by_patches(run) -> bool:
     return run._patches is not None and run._patches.fits
 
 
-@pytest.mark.parametrize("device", DEVICES)
-@pytest.mark.parametrize("dtype", DTYPES)
-@pytest.mark.parametrize("batch", BATCHES)
-@pytest.mark.parametrize("each", ["", "rest", "weights"])
-@pytest.mark.parametrize("correctives", [False, True], ids=["skinning", "correctives"])
-@pytest.mark.parametrize("clipped", [False, True], ids=["squares", "clipped"])
+@cases(BATCHES)
 def test_it_agrees(clipped, correctives, each, batch, dtype, device):
-    given = inputs(
-        batch, dtype, bodies=batch if each == "rest" else 1, weighted=batch if each == "weights" else 1,
-        correctives=correctives, clipped=clipped, device=device,
-    )  # fmt: skip
-    one, other = (model(dtype, warp=warp, correctives=correctives, device=device) for warp in (False, True))
-    expected, found = one(**given, distances=True), other(**given, distances=True)
-    assert by_patches(other)
-    assert_near(found, expected)
-    for distances in (False, True):
-        less = other(**given, gradient=False, distances=distances)
-        assert_near(less[:1], found[:1])
-        assert less.forces is less.pull is None
-        assert_near(less[3:], found[3:] if distances else [None])
-    assert_near(other(**given)[:3], found[:3])
+    assert by_patches(check_twin(clipped, correctives, each, batch, dtype, device, exact=False))
 
 
 def random_mesh(seed, vertices, joints, activations, *, dtype, device):
