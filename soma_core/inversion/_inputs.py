@@ -7,8 +7,9 @@ from torch import Tensor
 
 from soma_core.errors import InputError
 from soma_core.geometry.torch_func import transformed
+from soma_core.layer import SomaLayer
 
-__all__ = ["check_vertices", "check_weights", "refuse_transforms", "refuse_unit_error"]
+__all__ = ["check_vertices", "check_weights", "refuse_transforms", "refuse_unit_error", "without_gaps"]
 
 _UNIT_FACTORS = (1000.0, 100.0, 10.0, 0.1, 0.01, 0.001)
 
@@ -74,3 +75,17 @@ def refuse_unit_error(scale: Tensor) -> None:
                 expected="metres on the canonical topology, or the backend's own unit",
                 fix=f"Multiply the vertices by {1 / factor:g}.",
             )
+
+
+def without_gaps(vertices: Tensor, weights: Tensor, layer: SomaLayer) -> tuple[Tensor, Tensor]:
+    """Vertices with a value everywhere, and (F,) whether all that count had one.
+
+    Vertices of zero weight may be NaN or infinite; a frame with others is filled with the rig's bind shape.
+    """
+    finite = torch.isfinite(vertices.sum((1, 2)))
+    if bool(finite.all()):
+        return vertices, finite
+    known = torch.isfinite(vertices).all(-1)
+    whole = (known | (weights == 0)).all(1)
+    bind = torch.tensor(layer.rig.bind_shape, dtype=vertices.dtype, device=vertices.device)
+    return torch.where((known & whole[:, None])[..., None], vertices, bind), whole

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import TYPE_CHECKING, Literal, get_args
 
 import torch
@@ -13,7 +13,13 @@ from torch import Tensor
 from soma_core._derived import Derived, own_precision
 from soma_core._inputs import check_bone_scale
 from soma_core.errors import InputError
-from soma_core.inversion._inputs import check_vertices, check_weights, refuse_transforms, refuse_unit_error
+from soma_core.inversion._inputs import (
+    check_vertices,
+    check_weights,
+    refuse_transforms,
+    refuse_unit_error,
+    without_gaps,
+)
 from soma_core.inversion.analytical import AnalyticalOptions
 from soma_core.inversion.autograd import AutogradOptions
 from soma_core.inversion.implicit import attach_gradient
@@ -21,12 +27,12 @@ from soma_core.inversion.ladder import Ladder
 from soma_core.inversion.model import PoseModel
 from soma_core.inversion.moments import RestMoments
 from soma_core.inversion.priors import PosePriors, joint_terms, neighbour_mean, twist_doubt, with_references
-from soma_core.inversion.problem import Pose, Problem, part_of
+from soma_core.inversion.problem import Pose, Problem
 from soma_core.inversion.refine import clumping
 from soma_core.inversion.result import InversionResult, joined
 from soma_core.inversion.start import cloud_extent
-from soma_core.inversion.targets import LadderOptions, Stage, Targets
-from soma_core.inversion.whole import lopsided
+from soma_core.inversion.targets import Frames, LadderOptions, Stage, Targets
+from soma_core.inversion.whole import is_worse, lopsided, right_vertices
 from soma_core.layer import Kernels, SomaLayer
 from soma_core.rig import load_canonical
 from soma_core.skeleton.identity import Identity
@@ -47,34 +53,9 @@ _RESTING_SHARE = 0.015
 """A frame has converged under the full model when a Newton step would change it by less than this share of
 the error that is left: where correctives have a fold, the slope never vanishes."""
 
-_COLLAPSED = 0.1
-"""A joint whose cloud has less than this share of its extent left cannot be determined."""
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class _Frames:
-    """What is given for some frames: see :meth:`PoseInversion.forward`; `reference` for a temporal prior."""
-
-    vertices: Tensor
-    identity: Identity
-    weights: Tensor
-    bone_scale: Tensor | None
-    rest: dict[PoseModel, RestMoments]
-    initial: InversionResult | None = None
-    reference: Tensor | None = None
-
-    def part(self, chunk: slice) -> _Frames:
-        """What is given for a chunk of them."""
-        scale = self.bone_scale
-        return _Frames(
-            vertices=self.vertices[chunk],
-            identity=part_of(self.identity, chunk),
-            weights=self.weights[chunk] if len(self.weights) > 1 else self.weights,
-            bone_scale=scale[chunk] if scale is not None and len(scale) > 1 else scale,
-            rest=self.rest,
-            initial=None if self.initial is None else self.initial.part(chunk),
-            reference=None if self.reference is None else self.reference[chunk],
-        )
+_COLLAPSED, _LEFT = 0.1, 0.25
+"""A joint whose cloud has less than this share of its extent left cannot be determined, nor one that a robust
+fit leaves less than this share of its weight."""
 
 
 class PoseInversion(Derived):
@@ -205,7 +186,7 @@ class PoseInversion(Derived):
     if TYPE_CHECKING:  # torch says that a module returns anything
         __call__ = forward
 
-    def _with_gradient(self, vertices: Tensor, frames: _Frames, result: InversionResult) -> InversionResult:
+    def _with_gradient(self, vertices: Tensor, frames: Frames, result: InversionResult) -> InversionResult:
         if self.ladder.options.robust is not None or self.priors.temporal_strength:
             raise InputError(
                 "vertices",
@@ -216,7 +197,7 @@ class PoseInversion(Derived):
 
         def problem(chunk: slice) -> Problem:
             part = frames.part(chunk)
-            known, _ = _without_gaps(part.vertices, part.weights, self.layer)
+            known, _ = without_gaps(part.vertices, part.weights, self.layer)
             rest = part.rest.get(self.model)
             made = self.model.problem(known, part.identity, part.weights, part.bone_scale, self.terms, rest)
             if self.doubt is None:
@@ -241,7 +222,7 @@ class PoseInversion(Derived):
         weights: Tensor | None,
         bone_scale: Tensor | None,
         initial: InversionResult | None,
-    ) -> _Frames:
+    ) -> Frames:
         """Check what belongs to the frames, and bring it together."""
         count = len(vertices)
         self.layer.check_identity(identity)
@@ -261,12 +242,12 @@ class PoseInversion(Derived):
                 "initial", got=f"{len(initial.rotations)} frames", expected=f"{count} frames",
                 fix="Give the earlier result of the same frames.",
             )  # fmt: skip
-        return _Frames(
+        return Frames(
             vertices=vertices, identity=identity, weights=weights, bone_scale=bone_scale, initial=initial,
             rest={model: model.prepared(identity, weights) for model in self.ladder.models} if shared else {},
         )  # fmt: skip
 
-    def _fit_all(self, frames: _Frames) -> InversionResult:
+    def _fit_all(self, frames: Frames) -> InversionResult:
         """Fit chunk by chunk."""
         count, size = len(frames.vertices), max(_CHUNK, self.model.frames_on_gpu())
         starts = range(0, count, size) or (0,)
@@ -299,22 +280,54 @@ class PoseInversion(Derived):
         correspondence = None if wrap is None else load_correspondence(wrap, mid)
         return make_transfer(layer.spec, layer.mesh, correspondence, dtype=layer.dtype, device=layer.device)
 
-    def _fit(self, frames: _Frames) -> tuple[InversionResult, Tensor]:
-        """Result and scale of a chunk of frames."""
-        vertices, finite = _without_gaps(frames.vertices, frames.weights, self.layer)
+    def _fit(self, frames: Frames) -> tuple[InversionResult, Tensor]:
+        """Result and scale of a chunk of frames; a robust fit takes what a first one finds right.
+
+        Where that explains less, since vertices were taken for wrong that are not, the first one stays and
+        has not converged.
+        """
+        robust = self.options.robust
+        if robust is None:
+            return self._result(frames, *self._posed(frames))
+        pose, problem = self._posed(frames, robust)
+        near = replace(pose, translation=pose.translation - problem.origin)
+        error, _ = self.model.distances(problem, near)
+        assert error is not None
+        _, finite = without_gaps(frames.vertices, frames.weights, self.layer)
+        error.masked_fill_(~finite[:, None], torch.nan)
+        right = replace(frames, weights=right_vertices(error, frames.weights, robust), rest={})
+        result, scale = self._result(right, *self._posed(right), among=problem)
+        worse = is_worse(result.vertex_error, error, frames.weights, robust) & result.valid
+        if bool(worse.any()):
+            first, _ = self._result(frames, pose, problem)
+            result = result.where(~worse, replace(first, converged=torch.zeros_like(worse)))
+        return result, scale
+
+    def _posed(self, frames: Frames, robust: float | None = None) -> tuple[Pose, Problem]:
+        """Pose of a chunk of frames, its translation in the world, and the problem that it answers."""
+        vertices, _ = without_gaps(frames.vertices, frames.weights, self.layer)
         terms, strength = self.terms, self.priors.temporal_strength
         if frames.reference is not None:
             terms = with_references(terms, frames.reference, strength)
         targets = Targets(
             vertices=vertices, identity=frames.identity, weights=frames.weights, terms=terms,
-            bone_scale=frames.bone_scale, doubt=self.doubt, rest=frames.rest,
+            bone_scale=frames.bone_scale, doubt=self.doubt, rest=frames.rest, robust=robust,
         )  # fmt: skip
-        eye = torch.eye(3, dtype=vertices.dtype, device=vertices.device)
         start = None
         if frames.initial is not None:
             relative = torch.cat((self._still(vertices), frames.initial.rotations), 1)
             start = Pose.begin(relative, frames.initial.translation)
-        pose, problem = self.ladder(targets, start)
+        return self.ladder(targets, start)
+
+    def _result(
+        self, frames: Frames, pose: Pose, problem: Problem, among: Problem | None = None
+    ) -> tuple[InversionResult, Tensor]:
+        """What a pose is worth, and the scale of the bodies.
+
+        Joints of which `problem` leaves out most vertices that `among` has are not determined.
+        """
+        vertices, finite = without_gaps(frames.vertices, frames.weights, self.layer)
+        eye = torch.eye(3, dtype=vertices.dtype, device=vertices.device)
         rest = problem.rest
         extent, side = cloud_extent(problem.target, rest)
         known = torch.where(rest.own[..., 3, 3] > 0, extent, torch.nan)
@@ -330,11 +343,14 @@ class PoseInversion(Derived):
         error = error.masked_fill_(~usable[:, None], torch.nan)
         if vertices is not frames.vertices:
             error.masked_fill_(~torch.isfinite(frames.vertices).all(-1), torch.nan)
-        determined = self._determined(extent > _COLLAPSED) & usable[:, None]
+        kept = extent > _COLLAPSED
+        if among is not None:
+            kept = kept & (rest.own[..., 3, 3] > _LEFT * among.rest.own[..., 3, 3])
+        determined = self._determined(kept) & usable[:, None]
         residual = (energy / mass).sqrt()
-        resting = self.ladder.options.tolerance if self.ladder.whole is None else _RESTING_SHARE * residual
+        resting = self.options.tolerance if self.ladder.plain else _RESTING_SHARE * residual
         rests = (pose.last_change < resting) | (pose.last_change == 0)
-        if self.ladder.whole is not None and self.ladder.options.robust is None:
+        if not self.ladder.plain:
             rests = rests & ~lopsided(error, problem.weights, residual)
         return InversionResult(
             rotations=relative[:, 1:],
@@ -379,17 +395,3 @@ def _any_of(flags: Tensor, owner: Tensor, count: int) -> Tensor:
     """(F, count) whether any flag (F, H) of each owner is set."""
     total = flags.new_zeros(len(flags), count, dtype=torch.int64).index_add(1, owner, flags.long())
     return total > 0
-
-
-def _without_gaps(vertices: Tensor, weights: Tensor, layer: SomaLayer) -> tuple[Tensor, Tensor]:
-    """Vertices with a value everywhere, and (F,) whether all that count had one.
-
-    Vertices of zero weight may be NaN or infinite; a frame with others is filled with the rig's bind shape.
-    """
-    finite = torch.isfinite(vertices.sum((1, 2)))
-    if bool(finite.all()):
-        return vertices, finite
-    known = torch.isfinite(vertices).all(-1)
-    whole = (known | (weights == 0)).all(1)
-    bind = torch.tensor(layer.rig.bind_shape, dtype=vertices.dtype, device=vertices.device)
-    return torch.where((known & whole[:, None])[..., None], vertices, bind), whole

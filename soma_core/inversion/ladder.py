@@ -35,7 +35,7 @@ class Ladder(torch.nn.Module):
 
     Attributes:
         model: what is fitted in the end.
-        whole: descends on the full model; None where plain skinning is fitted.
+        whole: descends on the full model, or on residuals that are clipped.
     """
 
     def __init__(self, layer: SomaLayer, options: LadderOptions, *, warp: bool) -> None:
@@ -49,8 +49,7 @@ class Ladder(torch.nn.Module):
         paper = set(options.stages) - {"procrustes", "gauss_newton"}
         if paper and not plain:
             self.skinned = PoseModel(layer, plain=True, warp=warp)
-        descends = not plain or options.robust is not None
-        self.whole = WholeFit(self.coarse, self.model, options) if descends else None
+        self.plain, self.whole = plain, WholeFit(self.coarse, self.model, options)
         solver, structure = self.skinned.solver, self.skinned.structure
         if "transfer" in options.stages:
             kind = {"dtype": layer.dtype, "device": layer.device}
@@ -85,9 +84,7 @@ class Ladder(torch.nn.Module):
             near = None if pose is None else _moved(pose, -problem.origin)
             pose = _moved(getattr(self, f"_{stage}")(problem, near, model), problem.origin)
         assert pose is not None
-        if self.whole is not None and (
-            "gauss_newton" in self.options.stages or self.options.robust is not None
-        ):
+        if targets.robust is not None or ("gauss_newton" in self.options.stages and not self.plain):
             return self.whole(targets, pose)
         if problem is None or model is not self.model:
             problem = targets.problem(self.model)

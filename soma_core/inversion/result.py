@@ -25,7 +25,8 @@ class InversionResult:
         valid: (frames,) bool; False where a frame could not be used (NaN, collapsed, mirrored, out of scale).
             Its rotations are identity, and no other frame is affected.
         determined: (frames, J - 1) bool; whether the target determines the joint's rotation. False for joints
-            without skin weight, without weighted vertices, or whose vertices have collapsed to a point.
+            without skin weight, without weighted vertices, whose vertices have collapsed to a point, or most of
+            whose vertices a robust fit left out.
         converged: (frames,) bool; a Newton step under the model that was fitted would change the frame by
             less than a hundredth or so of the error that is left, and that is not all on few of the
             vertices, as it is where a limb stopped in a wrong place, or where a few vertices are wrong and
@@ -48,6 +49,14 @@ class InversionResult:
     iterations: Tensor
     residual: Tensor
     angle_std: Tensor
+
+    def where(self, chosen: Tensor, other: InversionResult) -> InversionResult:
+        """This result for the frames `chosen` (frames,), another's for the rest."""
+        parts = {}
+        for one in fields(self):
+            own, their = getattr(self, one.name), getattr(other, one.name)
+            parts[one.name] = torch.where(chosen.view(-1, *[1] * (own.ndim - 1)), own, their)
+        return InversionResult(**parts)
 
     def part(self, chunk: slice) -> InversionResult:
         """The result of a chunk of frames."""

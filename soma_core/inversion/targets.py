@@ -14,10 +14,11 @@ from soma_core.inversion.autograd import AutogradOptions
 from soma_core.inversion.model import PoseModel
 from soma_core.inversion.moments import RestMoments
 from soma_core.inversion.priors import JointTerms, TwistDoubt
-from soma_core.inversion.problem import Problem
+from soma_core.inversion.problem import Problem, part_of
+from soma_core.inversion.result import InversionResult
 from soma_core.skeleton.identity import Identity
 
-__all__ = ["LadderOptions", "Stage", "Targets"]
+__all__ = ["Frames", "LadderOptions", "Stage", "Targets"]
 
 Stage = Literal["procrustes", "transfer", "analytical", "gauss_newton", "autograd"]
 
@@ -33,9 +34,10 @@ class LadderOptions:
         tolerance: a frame has converged when a step changes its root mean square error, squared, by less
             than this, squared [m].
         analytical, autograd: options of these stages.
-        robust: residuals beyond this, and beyond twice the frame's median, count linearly (Huber) [m]; None
-            is least squares.
-        robust_rounds: how often the residuals are looked at again.
+        robust: a first fit in which residuals beyond this, and beyond twice the frame's median, count
+            linearly (Huber) [m] tells which vertices are wrong; the stages are run without them. None
+            takes all vertices.
+        robust_rounds: how often the residuals of the first fit are looked at again.
         refreshes: largest number of steps of ``gauss_newton`` under the full model, with twist joints and
             correctives; 0 fits plain skinning.
 
@@ -87,6 +89,8 @@ class Targets:
         terms: soft terms and hinges; None without.
         doubt: of the joints' twists, under the full model; None without.
         rest: moments of the one identity by model, where there is one.
+        robust: residuals beyond this, and beyond twice the frame's median, count linearly [m]; None is least
+            squares.
         problems: those already made, by model.
     """
 
@@ -97,6 +101,7 @@ class Targets:
     terms: JointTerms | None
     doubt: TwistDoubt | None
     rest: dict[PoseModel, RestMoments]
+    robust: float | None = None
     problems: dict[PoseModel, Problem] = field(default_factory=dict)
 
     def problem(self, model: PoseModel) -> Problem:
@@ -107,3 +112,29 @@ class Targets:
             )
             self.problems[model] = replace(problem, doubt=self.doubt)
         return self.problems[model]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Frames:
+    """What is given for some frames: see ``PoseInversion.forward``; `reference` for a temporal prior."""
+
+    vertices: Tensor
+    identity: Identity
+    weights: Tensor
+    bone_scale: Tensor | None
+    rest: dict[PoseModel, RestMoments]
+    initial: InversionResult | None = None
+    reference: Tensor | None = None
+
+    def part(self, chunk: slice) -> Frames:
+        """What is given for a chunk of them."""
+        scale = self.bone_scale
+        return Frames(
+            vertices=self.vertices[chunk],
+            identity=part_of(self.identity, chunk),
+            weights=self.weights[chunk] if len(self.weights) > 1 else self.weights,
+            bone_scale=scale[chunk] if scale is not None and len(scale) > 1 else scale,
+            rest=self.rest,
+            initial=None if self.initial is None else self.initial.part(chunk),
+            reference=None if self.reference is None else self.reference[chunk],
+        )

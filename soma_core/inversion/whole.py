@@ -14,7 +14,7 @@ from soma_core.inversion.problem import Pose, Problem
 from soma_core.inversion.refine import Refinement, clumping
 from soma_core.inversion.targets import LadderOptions, Targets
 
-__all__ = ["WholeFit", "lopsided"]
+__all__ = ["WholeFit", "is_worse", "lopsided", "right_vertices"]
 
 _ROUNDS, _STEPS = 2, 5
 """How often offsets and limbs' twists are looked at before the descent, and steps on moments after each."""
@@ -37,6 +37,10 @@ in a fold of the correctives beside its minimum, and is tried from further limb 
 _LOPSIDED = 0.1
 """Median over root mean square error: 0.9 where noise is left, 0.19 to 0.47 on meshes of another rig, 0.04
 where limbs stopped in a wrong place."""
+
+_WRONG = 2.0
+"""A vertex is wrong where its residual is this many times as long as one that begins to count linearly: four
+times the median, which noise hardly reaches."""
 
 _TRIED = ((0.2, -0.2), (0.45, -0.45))
 """Those twists, against what was found [rad]: pairs, the second for what the first leaves in doubt."""
@@ -70,6 +74,38 @@ def lopsided(distances: Tensor, weights: Tensor, residual: Tensor) -> Tensor:
     return large & (median_distance(distances, weights) < _LOPSIDED * residual)
 
 
+def _clip(distances: Tensor, weights: Tensor, robust: float) -> _Clip:
+    """Where distances (F, v) begin to count linearly."""
+    typical = median_distance(distances, weights)
+    return _Clip(bound=(2 * typical).clamp_min(robust), typical=typical)
+
+
+def right_vertices(distances: Tensor, weights: Tensor, robust: float) -> Tensor:
+    """Weights (F, v) of the vertices that are not wrong; a frame without any distance keeps its own.
+
+    Args:
+        distances: vertex errors (F, v) of a robust fit [m], NaN where there is none.
+        weights: (1 or F, v).
+        robust: see :class:`LadderOptions`.
+    """
+    bound = _clip(distances, weights, robust).bound
+    right = distances < _WRONG * bound[:, None]
+    return torch.where(right | ~right.any(1, keepdim=True), weights, 0.0)
+
+
+def is_worse(second: Tensor, first: Tensor, weights: Tensor, robust: float) -> Tensor:
+    """Whether a second fit explains frames (F,) clearly less than the first, wrong vertices apart.
+
+    Args:
+        second, first: their vertex errors (F, v) [m]; none counts more than the longest that is right.
+        weights: (1 or F, v).
+        robust: see :class:`LadderOptions`.
+    """
+    bound = _WRONG * _clip(first, weights, robust).bound[:, None]
+    after, before = ((weights * torch.minimum(one, bound).square()).nansum(1) for one in (second, first))
+    return after > 1.1 * before + weights.sum(1) * _DOUBTFUL[0] ** 2
+
+
 class WholeFit:
     """From a pose fitted to moments of skinning to the minimum of the whole model.
 
@@ -97,29 +133,28 @@ class WholeFit:
         problem = targets.problem(self.coarse)
         steps = pose.accepted
         pose = replace(pose, translation=pose.translation - problem.origin)
-        pose, clip = self._approached(problem, pose)
+        pose, clip = self._approached(problem, pose, targets.robust)
         pose = self._descended(self.coarse, problem, pose, clip)
-        if self.options.robust is None:
+        if clip is None:
             pose = self._searched(problem, pose)
         if self.coarse is not self.model:
             world = pose.translation + problem.origin
             problem = targets.problem(self.model)
             pose = replace(pose, translation=world - problem.origin)
-            if clip is not None:
-                clip = self._clip(self.model, problem, pose)
-            pose = self._descended(self.model, problem, pose, clip)
+            if clip is None:  # else few vertices tell well enough which of all are wrong
+                pose = self._descended(self.model, problem, pose, None)
         accepted = steps + pose.accepted
         return replace(pose, translation=pose.translation + problem.origin, accepted=accepted), problem
 
-    def _approached(self, problem: Problem, pose: Pose) -> tuple[Pose, _Clip | None]:
+    def _approached(self, problem: Problem, pose: Pose, robust: float | None) -> tuple[Pose, _Clip | None]:
         """Offsets, clips and the limbs' twist are looked at in turns with steps on moments."""
-        model, robust = self.coarse, self.options.robust is not None
-        rounds, clip = self.options.robust_rounds if robust else _ROUNDS, None
+        model, clip = self.coarse, None
+        rounds = _ROUNDS if robust is None else self.options.robust_rounds
         for done in range(rounds):
-            if robust:
-                clip = self._clip(model, problem, pose)
-            pose = self._shared(problem, pose, clip, near=done > 0 and not robust)
-            if done == rounds - 1 and not robust:
+            if robust is not None:
+                clip = self._clip(problem, pose, robust)
+            pose = self._shared(problem, pose, clip, near=done > 0 and clip is None)
+            if done == rounds - 1 and clip is None:
                 break
             view = model.view(problem, pose, None if clip is None else clip.bound)
             pose = model.solver(
@@ -171,13 +206,10 @@ class WholeFit:
         hinged = (problem.terms.hinge_axis != 0).any(-1)
         return frozenset(self.coarse.solver.variables[hinged].tolist())
 
-    def _clip(self, model: PoseModel, problem: Problem, pose: Pose) -> _Clip:
-        """Where residuals begin to count linearly."""
-        assert self.options.robust is not None
-        distances, _ = model.distances(problem, pose)
+    def _clip(self, problem: Problem, pose: Pose, robust: float) -> _Clip:
+        distances, _ = self.coarse.distances(problem, pose)
         assert distances is not None
-        typical = median_distance(distances, problem.weights)
-        return _Clip(bound=(2 * typical).clamp_min(self.options.robust), typical=typical)
+        return _clip(distances, problem.weights, robust)
 
     def _descended(self, model: PoseModel, problem: Problem, pose: Pose, clip: _Clip | None) -> Pose:
         """Descent on the model."""
