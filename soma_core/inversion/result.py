@@ -25,8 +25,8 @@ class InversionResult:
         valid: (frames,) bool; False where a frame could not be used (NaN, collapsed, mirrored, out of scale).
             Its rotations are identity, and no other frame is affected.
         determined: (frames, J - 1) bool; whether the target determines the joint's rotation. False for joints
-            without skin weight, without weighted vertices, whose vertices have collapsed to a point, or most of
-            whose vertices a robust fit left out.
+            without skin weight, without weighted vertices, whose vertices have collapsed to a point, or of
+            which a robust fit left out most vertices.
         converged: (frames,) bool; a Newton step under the model that was fitted would change the frame by
             less than a hundredth or so of the error that is left, and that is not all on few of the
             vertices, as it is where a limb stopped in a wrong place, or where a few vertices are wrong and
