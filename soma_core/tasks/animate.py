@@ -57,6 +57,7 @@ def run(config: DictConfig, output: Path) -> None:
         name, own = backend_of(motion), {**motion.identity.get("options", {}), **own}
     layer = open_layer(options, name, own)
     stored = dict(motion.identity) if kept else {"backend": layer.backend, "params": chosen.params}
+    stored |= {"options": layer.options} if layer.options else {}
     _log.info("%s: %d frames at %g fps", motion.source, motion.frame_count, motion.fps)
     with torch.no_grad():
         identity = stored_identity(layer, stored)
