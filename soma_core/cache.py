@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import logging
 import os
+import shutil
 import tempfile
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -15,7 +16,15 @@ from soma_core.errors import AssetError
 from soma_core.npz import open_npz_file
 from soma_core.paths import cache_dir
 
-__all__ = ["atomic_arrays", "atomic_text", "atomic_write", "cached_arrays", "content_key", "file_sha256"]
+__all__ = [
+    "atomic_arrays",
+    "atomic_folder",
+    "atomic_text",
+    "atomic_write",
+    "cached_arrays",
+    "content_key",
+    "file_sha256",
+]
 
 _log = logging.getLogger(__name__)
 
@@ -57,6 +66,19 @@ def atomic_write(path: Path, write: Callable[[Path], object]) -> None:
         temporary.replace(path)
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def atomic_folder(path: Path, write: Callable[[Path], object]) -> None:
+    """Let `write` fill a temporary folder beside `path`, then put it in the place of what is there."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = Path(tempfile.mkdtemp(dir=path.parent, prefix=f".{path.name}-"))
+    try:
+        write(temporary)
+        temporary.chmod(0o755)
+        shutil.rmtree(path, ignore_errors=True)
+        temporary.replace(path)
+    finally:
+        shutil.rmtree(temporary, ignore_errors=True)
 
 
 def atomic_text(path: Path, text: str) -> None:

@@ -35,6 +35,7 @@ __all__ = [
     "Picture",
     "PriorChoice",
     "Product",
+    "SmplLayout",
     "Topology",
     "Translation",
     "Upward",
@@ -47,6 +48,13 @@ class BodyGender(StrEnum):
     neutral = "neutral"
     male = "male"
     female = "female"
+
+
+class SmplLayout(StrEnum):
+    """Names of the keys that pose parameters of SMPL models are written under."""
+
+    amass = "amass"
+    smplx = "smplx"
 
 
 class ConvertResult(StrEnum):
@@ -110,12 +118,21 @@ class Lod(StrEnum):
 
 
 class Product(StrEnum):
-    """A file that a run can write."""
+    """A file that a run can write; ``soma_core.motion.writers`` has the table of them."""
 
     npz = "npz"
     usd = "usd"
     glb = "glb"
     png = "png"
+    joints = "joints"
+    csv = "csv"
+    keypoints = "keypoints"
+    vertices = "vertices"
+    obj = "obj"
+    ply = "ply"
+    pc2 = "pc2"
+    mdd = "mdd"
+    usdpoints = "usdpoints"
 
 
 class Topology(StrEnum):

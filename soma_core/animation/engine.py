@@ -145,6 +145,10 @@ class Animation(torch.nn.Module):
         """:meth:`pose` of arguments in one, T-pose-relative."""
         return self.pose(*body[:3], absolute=False, bone_scale=body.bone_scale, offsets=body.offsets)
 
+    def transforms(self, body: Body, *, absolute: bool) -> Tensor:
+        """World transforms of the joints alone (B, J, 4, 4) [m], without the mesh."""
+        return to_homogeneous(*self._walk(*body[:4], absolute=absolute))
+
     def pose_all(self, bodies: Iterable[Body], batch: int, *, absolute: bool) -> Posed:
         """Pose a stream of chunks; no derivative. Each is dropped after use.
 

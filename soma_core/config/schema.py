@@ -9,6 +9,7 @@ from hydra.core.config_store import ConfigStore
 from omegaconf import MISSING
 
 from soma_core.motion.options import ConvertOptions, InvertOptions
+from soma_core.motion.writers import WriteOptions
 from soma_core.options import (
     BackendChoice,
     FitLod,
@@ -58,11 +59,13 @@ class _PlayedMotion(Options):
 
 
 @dataclass(kw_only=True)
-class AnimateConfig(ModelOptions, _PlayedMotion):
+class AnimateConfig(ModelOptions, WriteOptions, _PlayedMotion):
     """Configuration of ``soma animate``."""
 
     seed: int = 0
-    write: list[Product] = field(default_factory=lambda: list(Product))
+    write: list[Product] = field(
+        default_factory=lambda: [Product.npz, Product.usd, Product.glb, Product.png]
+    )
     picture: Picture = field(default_factory=Picture)
 
 

@@ -18,7 +18,7 @@ from soma_core.rig.skeleton import Rig
 if TYPE_CHECKING:
     from soma_core.skeleton.identity import Identity
 
-__all__ = ["BODY_COLOUR", "SkinnedClip", "linear_colour", "skinned_clip"]
+__all__ = ["BODY_COLOUR", "SkinnedClip", "linear_colour", "skinned_clip", "t_pose_world"]
 
 BODY_COLOUR = (0.80, 0.66, 0.58)
 """sRGB colour of a body that has no other."""
@@ -110,7 +110,7 @@ def skinned_clip(
         count = len(rig.procedural.joint_names)
         world = np.concatenate([world, _array("helpers", helpers, (len(world), count, 4, 4))], axis=1)
         rig, bind_world = expanded_rig(rig), np.concatenate([bind_world, helper_bind(rig, bind_world)])
-    t_pose = _t_pose(rig, bind_world)
+    t_pose = t_pose_world(rig, bind_world)
     local = _to_local(world, rig.parents)
     return SkinnedClip(
         mesh=mesh,
@@ -140,8 +140,13 @@ def _array(argument: str, value: Any, shape: tuple[int, ...]) -> np.ndarray:
     return array
 
 
-def _t_pose(rig: Rig, bind_world: np.ndarray) -> np.ndarray:
-    """T-pose of an identity: the rig's T-pose rotations on the identity's own bones."""
+def t_pose_world(rig: Rig, bind_world: np.ndarray) -> np.ndarray:
+    """World transforms (J, 4, 4) [m] of an identity's T-pose: the rig's rotations there, its own bones.
+
+    Args:
+        rig: joint tree and T-pose.
+        bind_world: (J, 4, 4) of the identity in the bind pose [m].
+    """
     bones = _to_local(bind_world[None], rig.parents)[0, :, :3, 3]
     world = np.tile(np.eye(4), (rig.joint_count, 1, 1))
     world[:, :3, :3] = rig.t_pose_world[:, :3, :3]

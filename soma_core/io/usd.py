@@ -1,4 +1,4 @@
-"""Write a skinned animation as a UsdSkel file."""
+"""Write a skinned animation as UsdSkel, or vertices over time as a point cache."""
 
 from __future__ import annotations
 
@@ -11,10 +11,14 @@ from soma_core.cache import atomic_write
 from soma_core.errors import InputError
 from soma_core.geometry.mesh import vertex_normals
 from soma_core.io.clip import SkinnedClip, linear_colour
+from soma_core.io.vertex_writers import MeshFrames
 
-__all__ = ["write_usd"]
+__all__ = ["write_usd", "write_usd_points"]
 
 _SUFFIXES = (".usdc", ".usda", ".usd")
+
+_SAVED_FRAMES = 64
+"""Frames in memory before they go to the file: 14 MB of the mid mesh."""
 
 
 def write_usd(path: str | Path, clip: SkinnedClip) -> None:
@@ -44,17 +48,56 @@ def _export(stage: Any, path: Path) -> None:
         raise OSError(f"usd-core could not write {path}")
 
 
+def write_usd_points(path: Path, mesh: MeshFrames) -> None:
+    """Write a mesh whose points and extent have a sample at each time code, one a frame; ``.usdc``.
+
+    Frames are saved as they come: the file grows, memory does not.
+
+    Raises:
+        InputError: an upward axis that USD has no name for.
+    """
+    from pxr import Usd, UsdGeom, Vt
+
+    if mesh.up not in ("+y", "+z"):
+        raise InputError("up", got=mesh.up, expected="+y or +z, which USD has names for", fix="Turn it.")
+
+    def write(temporary: Path) -> None:
+        temporary.unlink()  # USD makes a layer only where no file is
+        stage = Usd.Stage.CreateNew(str(temporary))
+        _set_up(stage, frame_count=mesh.frame_count, fps=mesh.fps, metres=mesh.metres, up=mesh.up)
+        stage.GetRootLayer().customLayerData = {"soma_core": {"source": mesh.source}}
+        shown = UsdGeom.Mesh.Define(stage, "/Mesh")
+        stage.SetDefaultPrim(shown.GetPrim())
+        _set_faces(shown, mesh.counts, mesh.indices, mesh.uv, mesh.uv_indices)
+        points, extent = shown.CreatePointsAttr(), shown.CreateExtentAttr()
+        for number, frame in mesh.numbered():
+            points.Set(Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(frame)), number)
+            extent.Set(Vt.Vec3fArray.FromNumpy(np.stack([frame.min(axis=0), frame.max(axis=0)])), number)
+            if number % _SAVED_FRAMES == _SAVED_FRAMES - 1:
+                stage.Save()
+        stage.Save()
+
+    atomic_write(path, write)
+
+
+def _set_up(stage: Any, *, frame_count: int, fps: float, metres: float = 1.0, up: str = "+y") -> None:
+    """Axes, unit and the range of time codes."""
+    from pxr import UsdGeom
+
+    UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.z if up == "+z" else UsdGeom.Tokens.y)
+    UsdGeom.SetStageMetersPerUnit(stage, metres)
+    stage.SetTimeCodesPerSecond(fps)
+    stage.SetFramesPerSecond(fps)
+    stage.SetStartTimeCode(0)
+    stage.SetEndTimeCode(frame_count - 1)
+
+
 def _stage(clip: SkinnedClip) -> Any:
     """Build the stage in memory."""
-    from pxr import Usd, UsdGeom, UsdSkel
+    from pxr import Usd, UsdSkel
 
     stage = Usd.Stage.CreateInMemory()
-    UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.y)
-    UsdGeom.SetStageMetersPerUnit(stage, 1.0)
-    stage.SetTimeCodesPerSecond(clip.fps)
-    stage.SetFramesPerSecond(clip.fps)
-    stage.SetStartTimeCode(0)
-    stage.SetEndTimeCode(clip.frame_count - 1)
+    _set_up(stage, frame_count=clip.frame_count, fps=clip.fps)
     stage.GetRootLayer().customLayerData = {"soma_core": dict(clip.metadata)}
     root = UsdSkel.Root.Define(stage, f"/{_identifier(clip.name)}")
     stage.SetDefaultPrim(root.GetPrim())
@@ -108,25 +151,35 @@ def _add_skeleton(stage: Any, path: str, clip: SkinnedClip) -> None:
 
 
 def _add_mesh(stage: Any, path: str, clip: SkinnedClip) -> Any:
-    from pxr import Sdf, UsdGeom, Vt
+    from pxr import UsdGeom, Vt
 
     mesh = UsdGeom.Mesh.Define(stage, path)
     points = clip.rest.astype(np.float32)
     mesh.CreatePointsAttr(Vt.Vec3fArray.FromNumpy(points))
     mesh.CreateExtentAttr(Vt.Vec3fArray.FromNumpy(np.stack([points.min(axis=0), points.max(axis=0)])))
-    mesh.CreateFaceVertexCountsAttr(_ints(clip.mesh.face_vert_counts))
-    mesh.CreateFaceVertexIndicesAttr(_ints(clip.mesh.face_vert_indices))
-    mesh.CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)
+    shown = clip.mesh
+    _set_faces(mesh, shown.face_vert_counts, shown.face_vert_indices, shown.uv, shown.uv_indices)
     normals = vertex_normals(clip.rest, clip.mesh.triangles).astype(np.float32)
     mesh.CreateNormalsAttr(Vt.Vec3fArray.FromNumpy(normals))
     mesh.SetNormalsInterpolation(UsdGeom.Tokens.vertex)
-    if len(clip.mesh.uv):
-        primvars = UsdGeom.PrimvarsAPI(mesh)
-        kind = Sdf.ValueTypeNames.TexCoord2fArray
-        st = primvars.CreatePrimvar("st", kind, UsdGeom.Tokens.faceVarying)
-        st.Set(Vt.Vec2fArray.FromNumpy(np.ascontiguousarray(clip.mesh.uv, np.float32)))
-        st.SetIndices(_ints(clip.mesh.uv_indices))
     return mesh
+
+
+def _set_faces(
+    mesh: Any, counts: np.ndarray, indices: np.ndarray, uv: np.ndarray, uv_indices: np.ndarray
+) -> None:
+    """Polygons, drawn as they are, and their texture coordinates where there are any."""
+    from pxr import Sdf, UsdGeom, Vt
+
+    mesh.CreateFaceVertexCountsAttr(_ints(counts))
+    mesh.CreateFaceVertexIndicesAttr(_ints(indices))
+    mesh.CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)
+    if not len(uv):
+        return
+    primvars = UsdGeom.PrimvarsAPI(mesh)
+    st = primvars.CreatePrimvar("st", Sdf.ValueTypeNames.TexCoord2fArray, UsdGeom.Tokens.faceVarying)
+    st.Set(Vt.Vec2fArray.FromNumpy(np.ascontiguousarray(uv, np.float32)))
+    st.SetIndices(_ints(uv_indices))
 
 
 def _ints(values: np.ndarray) -> Any:

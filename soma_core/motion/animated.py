@@ -15,6 +15,7 @@ from soma_core.errors import InputError
 from soma_core.io.motion import Motion
 from soma_core.io.motion_files import check_rig, read_motion
 from soma_core.layer import SomaLayer
+from soma_core.motion.identities import kept_identity
 from soma_core.options import FrameRange
 from soma_core.paths import assets_dir
 from soma_core.progress import progress
@@ -36,7 +37,7 @@ class Animated:
     """A motion on one identity.
 
     Attributes:
-        motion: the motion with the translation that was used.
+        motion: the motion with the translation that was used, and the identity that was posed.
         transforms: (frames, J, 4, 4) float32 world transforms [m].
         helpers: (frames, H, 4, 4) float32 world transforms of the twist joints [m]; H = 0 without them.
         vertices: frame -> posed vertices (v, 3) [m], for the frames asked for.
@@ -125,7 +126,10 @@ def animate(
     world[:, 1:, :3, 3] += shift  # Root, which is virtual, stays at the origin
     carried[..., :3, 3] += shift
     return Animated(
-        motion=replace(motion, translation=path + shift, rig_revision=layer.rig.revision),
+        motion=replace(
+            motion, translation=path + shift, rig_revision=layer.rig.revision,
+            identity=kept_identity(layer, identity),
+        ),  # fmt: skip
         transforms=world,
         helpers=carried,
         vertices={frame: vertices[frame] + shift for frame in sorted(vertices)},

@@ -20,7 +20,7 @@ from soma_core.motion.posed_input import PosedInput
 from soma_core.rig import load_canonical
 from soma_core.skeleton.identity import Identity
 
-__all__ = ["backend_of", "found_identity", "stored_identity"]
+__all__ = ["backend_of", "found_identity", "kept_identity", "stored_identity"]
 
 _log = logging.getLogger(__name__)
 
@@ -61,6 +61,18 @@ def stored_identity(layer: SomaLayer, stored: Mapping[str, Any]) -> Identity:
     if fitted.lod != "mid" and len(points) == load_canonical("mid")[0].vertex_count:
         points = points[fitted.mid_ids]
     return layer.identity_from_rest(torch.as_tensor(points[None]).to(layer.device, layer.dtype))
+
+
+def kept_identity(layer: SomaLayer, identity: Identity) -> dict[str, Any]:
+    """What a motion file keeps of an identity of this layer, for :func:`stored_identity` to make it again.
+
+    Nothing where that cannot be: of a rest shape, a layer of xlo holds less than it was made from.
+    """
+    named = {"backend": layer.backend, **({"options": dict(layer.options)} if layer.options else {})}
+    if identity.params:
+        return named | {"params": {name: value[0].tolist() for name, value in identity.params.items()}}
+    rest = identity.fitted_rest[0].detach().cpu().numpy()
+    return {} if layer.mesh.lod == "xlo" else named | {"params": {}, "rest": rest}
 
 
 @torch.no_grad()

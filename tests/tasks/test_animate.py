@@ -12,7 +12,7 @@ from soma_core.config.schema import AnimateConfig
 from soma_core.errors import InputError
 from soma_core.io import read_motion, write_motion
 from soma_core.layer import SomaLayer
-from soma_core.motion import animate, animated, load_clip
+from soma_core.motion import animate, animated, load_clip, stored_identity, write
 from soma_core.options import FrameRange
 from soma_core.tasks import animate as task
 
@@ -188,3 +188,24 @@ def test_the_extra_low_mesh_is_written_with_its_own_faces_and_texture(tmp_path):
     assert list(mesh.GetFaceVertexCountsAttr().Get()) == 1220 * [3]
     assert len(UsdGeom.PrimvarsAPI(mesh).GetPrimvar("st").ComputeFlattened()) == 3660
     assert read_motion(tmp_path / "motion.npz").rig_revision.endswith("-xlo")
+
+
+def test_the_options_of_a_backend_are_kept(smplh_models, tmp_path):
+    """The stand-in is female only: without its options the motion would play as a body that is not there."""
+    female = {"params": {"betas": [1.0, 0, 0]}, "options": {"gender": "female"}}
+    task.run(configured(backend={"name": "smplh", **female}, write=["npz"]), tmp_path)
+    assert read_motion(tmp_path / "motion.npz").identity == {"backend": "smplh", **female}
+    played = {"motion": str(tmp_path / "motion.npz"), "identity_from": "motion", "frames": {"stop": None}}
+    task.run(configured(write=["npz"], **played), tmp_path / "again")
+    assert read_motion(tmp_path / "again/motion.npz").identity == {"backend": "smplh", **female}
+
+
+@pytest.mark.parametrize("measured", [True, False], ids=["of parameters", "of a rest shape"])
+def test_the_motion_of_a_body_keeps_that_body(layer, motion, tmp_path, measured):
+    """In Python too, whatever body the motion was recorded with."""
+    body = layer.identity({"shape": [1.0]})
+    given = body if measured else layer.identity_from_rest(body.fitted_rest)
+    played = animate(layer, given, replace(motion, identity={"backend": "anny", "params": {"age": 0.1}})).motion
+    write(played, tmp_path / "m.npz")
+    again = stored_identity(layer, read_motion(tmp_path / "m.npz").identity)
+    torch.testing.assert_close(again.rest, given.rest, atol=GROUND_TOLERANCE, rtol=0)
