@@ -77,10 +77,14 @@ class Correctives(torch.nn.Module):
         """
         return self.offsets(self.features(relative)) * self.scale(bind_world)[:, None, None]
 
+    def activations(self, features: Tensor) -> Tensor:
+        """What the pose excites (activations, B), of features (B, J, 6); offsets are linear in it."""
+        active = torch.relu(self.first(features.flatten(1).T.contiguous()))
+        return torch.tanh(active) if self.use_tanh else active
+
     def offsets(self, features: Tensor) -> Tensor:
         """Offsets (B, v, 3) [m] of the canonical body from features (B, J, 6)."""
-        active = torch.relu(self.first(features.flatten(1).T.contiguous()))
-        moved = self.second(torch.tanh(active) if self.use_tanh else active)
+        moved = self.second(self.activations(features))
         return moved.view(-1, 3, len(features)).permute(2, 0, 1)
 
 

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import scipy.sparse
 from scipy.spatial.transform import Rotation
 
 from soma_core.errors import InputError
@@ -16,12 +17,23 @@ from soma_core.rig.mesh import CanonicalMesh
 from soma_core.rig.skeleton import Rig
 
 if TYPE_CHECKING:
+    from soma_core.correctives.shapes import CorrectiveShapes
     from soma_core.skeleton.identity import Identity
 
-__all__ = ["BODY_COLOUR", "SkinnedClip", "linear_colour", "skinned_clip", "t_pose_world"]
+__all__ = [
+    "BODY_COLOUR",
+    "SkinnedClip",
+    "four_influence_error",
+    "linear_colour",
+    "skinned_clip",
+    "t_pose_world",
+]
 
 BODY_COLOUR = (0.80, 0.66, 0.58)
 """sRGB colour of a body that has no other."""
+
+_READ = 4
+"""Influences of a vertex that many programs read, and no more."""
 
 _BONE_TOLERANCE = 1e-6
 """Change of a bone relative to the size of the scene that counts as float32 rounding of the transforms."""
@@ -30,6 +42,8 @@ _BONE_TOLERANCE = 1e-6
 @dataclass(frozen=True, kw_only=True, eq=False)
 class SkinnedClip:
     """What the exporters write. Metres, +Y up, column vectors, quaternions ``xyzw``.
+
+    The rest mesh stands on y = 0, for programs that show it without its skeleton.
 
     Attributes:
         mesh: topology and UVs.
@@ -43,6 +57,7 @@ class SkinnedClip:
         name: name of the body in the file.
         colour: sRGB colour in 0..1.
         metadata: texts stored in the file (licence, backend, rig revision, ...).
+        shapes: offsets of `rest` that the pose asks for, before skinning; None for none.
     """
 
     mesh: CanonicalMesh
@@ -56,11 +71,25 @@ class SkinnedClip:
     name: str = "Body"
     colour: tuple[float, float, float] = BODY_COLOUR
     metadata: Mapping[str, str] = field(default_factory=dict)
+    shapes: CorrectiveShapes | None = None
 
     @property
     def frame_count(self) -> int:
         """Number of frames."""
         return len(self.translations)
+
+    @property
+    def limits(self) -> dict[str, str]:
+        """How far a program that shows the file is off the body, in words, by key of the metadata."""
+        mean, worst = (1e3 * error for error in four_influence_error(self))
+        found = {
+            "influences": f"up to {self.influences()[0].shape[1]} a vertex; a program that reads {_READ} of "
+            f"them is {mean:.2g} mm off in the mean, {worst:.2g} mm at most"
+        }
+        if self.shapes is not None:
+            count, worst = len(self.shapes), 1e3 * self.shapes.worst
+            found["correctives"] = f"{count} morph targets, within {worst:.2g} mm of the model's correctives"
+        return found
 
     def t_pose_local(self) -> np.ndarray:
         """Local transforms of the T-pose, (J, 4, 4) [m]."""
@@ -70,6 +99,29 @@ class SkinnedClip:
         """Joint ids (v, k) int and weights (v, k) float32 of every influence, heaviest first, zero padded."""
         joint_ids, values = padded_influences(self.rig.weights.tocsr())
         return joint_ids, (values / values.sum(axis=1, keepdims=True)).astype(np.float32)
+
+
+def four_influence_error(clip: SkinnedClip) -> tuple[float, float]:
+    """Mean and largest error [m] over all frames where a program reads four influences of each vertex."""
+    joint_ids, weights = clip.influences()
+    few = np.where(np.arange(weights.shape[1]) < _READ, weights, 0).astype(np.float64)
+    change = few / few.sum(axis=1, keepdims=True) - weights
+    rows = np.flatnonzero(np.abs(change).max(axis=1) > 0)
+    shape = len(rows), len(clip.bind_world)
+    starts = np.arange(len(rows) + 1) * weights.shape[1]
+    lost = scipy.sparse.csr_array((change[rows].ravel(), joint_ids[rows].ravel(), starts), shape=shape)
+    points = np.column_stack([clip.rest[rows], np.ones(len(rows))])
+    inverse, local = np.linalg.inv(clip.bind_world), np.tile(np.eye(4), (shape[1], 1, 1))
+    total, worst = 0.0, 0.0
+    for translations, quaternions in zip(clip.translations, clip.quaternions, strict=True):
+        local[:, :3, 3], local[:, :3, :3] = translations, Rotation.from_quat(quaternions).as_matrix()
+        world = local.copy()
+        for joint in np.flatnonzero(clip.rig.parents >= 0):
+            world[joint] = world[clip.rig.parents[joint]] @ local[joint]
+        blended = (lost @ (world @ inverse)[:, :3].reshape(-1, 12)).reshape(-1, 3, 4)
+        error = np.linalg.norm(np.einsum("vab,vb->va", blended, points), axis=1)
+        total, worst = total + error.sum(), max(worst, float(error.max(initial=0)))
+    return total / (clip.frame_count * len(clip.rest)), worst
 
 
 def skinned_clip(
@@ -83,6 +135,7 @@ def skinned_clip(
     name: str = "Body",
     colour: tuple[float, float, float] = BODY_COLOUR,
     metadata: Mapping[str, str] | None = None,
+    shapes: CorrectiveShapes | None = None,
 ) -> SkinnedClip:
     """Gather what the exporters need from one identity and its posed world transforms.
 
@@ -98,6 +151,7 @@ def skinned_clip(
         name: name of the body in the file.
         colour: sRGB colour in 0..1.
         metadata: texts to store in the file.
+        shapes: of the correctives, one row of weights a frame; they become morph targets.
 
     Raises:
         InputError: a shape does not fit the rig, or the identity is a batch.
@@ -110,6 +164,9 @@ def skinned_clip(
         count = len(rig.procedural.joint_names)
         world = np.concatenate([world, _array("helpers", helpers, (len(world), count, 4, 4))], axis=1)
         rig, bind_world = expanded_rig(rig), np.concatenate([bind_world, helper_bind(rig, bind_world)])
+    lift = np.array([0.0, -rest[:, 1].min(), 0.0])
+    rest, bind_world = rest + lift, bind_world.copy()
+    bind_world[1:, :3, 3] += lift  # Root, which is virtual and carries no skin, stays at the origin
     t_pose = t_pose_world(rig, bind_world)
     local = _to_local(world, rig.parents)
     return SkinnedClip(
@@ -124,6 +181,7 @@ def skinned_clip(
         name=name,
         colour=colour,
         metadata=dict(metadata or {}),
+        shapes=shapes if shapes is not None and len(shapes) else None,
     )
 
 

@@ -55,6 +55,23 @@ class GlbBuffer:
         self.accessors.append(accessor)
         return len(self.accessors) - 1
 
+    def add_sparse(self, ids: np.ndarray, values: np.ndarray, *, count: int) -> int:
+        """Append an accessor of `count` entries, zero but for `values` (n, 3) float32 at `ids` (n,)."""
+        small = np.uint16 if count < 65535 else np.uint32
+        views = [self.accessors.pop(self.add(array))["bufferView"] for array in (ids.astype(small), values)]
+        bounds = np.concatenate([values, np.zeros((1 if len(ids) < count else 0, 3), np.float32)])
+        self.accessors.append(
+            {
+                "componentType": _COMPONENTS["float32"], "count": count, "type": "VEC3",
+                "min": bounds.min(axis=0).tolist(), "max": bounds.max(axis=0).tolist(),
+                "sparse": {
+                    "count": len(ids), "values": {"bufferView": views[1]},
+                    "indices": {"bufferView": views[0], "componentType": _COMPONENTS[np.dtype(small).name]},
+                },
+            }
+        )  # fmt: skip
+        return len(self.accessors) - 1
+
     @property
     def data(self) -> bytes:
         """The packed buffer, a multiple of four bytes."""

@@ -57,21 +57,36 @@ class GlbFile:
     def accessor(self, index: int) -> np.ndarray:
         """Values of an accessor, (count, ...); matrices as column-vector transforms (count, 4, 4)."""
         accessor = self.document["accessors"][index]
-        if "sparse" in accessor or "bufferView" not in accessor:
-            raise ValueError(f"accessor {index} is sparse")
-        dtype, shape = np.dtype(_COMPONENTS[accessor["componentType"]]), _SHAPES[accessor["type"]]
-        count = int(accessor["count"])
-        view = self.document["bufferViews"][accessor["bufferView"]]
+        shape, count = _SHAPES[accessor["type"]], int(accessor["count"])
+        if "bufferView" in accessor:
+            values = self._stored(accessor, accessor["componentType"], shape, count, f"accessor {index}")
+        else:  # zeros, but for sparse ones
+            dtype = np.dtype(_COMPONENTS[accessor["componentType"]])
+            self.check_expansion(count * dtype.itemsize * int(np.prod(shape, dtype=int)), "its arrays")
+            values = np.zeros((count, *shape), dtype)
+        if "sparse" in accessor:
+            sparse, what = accessor["sparse"], f"sparse accessor {index}"
+            ids, some = sparse["indices"], int(sparse["count"])
+            places = self._stored(ids, ids["componentType"], (), some, what)
+            if some and not (places.dtype.kind == "u" and places.max() < count):
+                raise ValueError(f"{what} has places outside it")
+            values[places] = self._stored(sparse["values"], accessor["componentType"], shape, some, what)
+        return np.swapaxes(values, -1, -2) if len(shape) == 2 else values
+
+    def _stored(
+        self, place: dict[str, Any], component: int, shape: tuple[int, ...], count: int, what: str
+    ) -> np.ndarray:
+        """A copy of `count` values at a place in a buffer view."""
+        dtype, view = np.dtype(_COMPONENTS[component]), self.document["bufferViews"][place["bufferView"]]
         if view["buffer"] != 0 or "uri" in self.document["buffers"][0]:
             raise ValueError("its arrays are in other files")
         size = dtype.itemsize * int(np.prod(shape, dtype=int))
-        offset = self._begin + view.get("byteOffset", 0) + accessor.get("byteOffset", 0)
+        offset = self._begin + view.get("byteOffset", 0) + place.get("byteOffset", 0)
         stride = view.get("byteStride", size)
         if stride < size:
-            raise ValueError(f"accessor {index} has overlapping values")
+            raise ValueError(f"{what} has overlapping values")
         rows = np.ndarray((count, size), np.uint8, self._data, offset=offset, strides=(stride, 1))
-        values = np.ascontiguousarray(rows).view(dtype).reshape(count, *shape)
-        return np.swapaxes(values, -1, -2) if len(shape) == 2 else values
+        return np.array(rows).view(dtype).reshape(count, *shape)
 
     def fractions(self, index: int) -> np.ndarray:
         """Values of an accessor as float32; integers count as fractions of their largest value."""

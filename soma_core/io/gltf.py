@@ -29,7 +29,8 @@ def write_gltf(path: str | Path, clip: SkinnedClip) -> None:
 
     All influences are kept in as many JOINTS_n / WEIGHTS_n sets as needed, heaviest first, so that a
     viewer that reads only the first set still shows the best four. The first v vertices are the canonical
-    ones in canonical order; copies that UV seams need follow.
+    ones in canonical order; copies that UV seams need follow. Correctives are morph targets, stored sparsely,
+    whose weights the animation moves.
 
     Args:
         path: a ``.glb`` file.
@@ -64,7 +65,7 @@ def _document(clip: SkinnedClip, buffer: GlbBuffer) -> dict[str, Any]:
         "scene": 0,
         "scenes": [{"nodes": [0, *roots]}],
         "nodes": [{"name": clip.name, "mesh": 0, "skin": 0}, *_joint_nodes(clip)],
-        "meshes": [{"name": clip.name, "primitives": [_primitive(clip, buffer)]}],
+        "meshes": [_mesh(clip, buffer)],
         "materials": [_material(clip)],
         "skins": [
             {
@@ -105,8 +106,27 @@ def _joint_nodes(clip: SkinnedClip) -> list[dict[str, Any]]:
     return nodes
 
 
-def _primitive(clip: SkinnedClip, buffer: GlbBuffer) -> dict[str, Any]:
+def _mesh(clip: SkinnedClip, buffer: GlbBuffer) -> dict[str, Any]:
+    """The mesh at rest, and its morph targets."""
     sources, uv, triangles = _split_at_seams(clip.mesh)
+    primitive = _primitive(clip, buffer, sources, uv, triangles)
+    mesh: dict[str, Any] = {"name": clip.name, "primitives": [primitive]}
+    if clip.shapes is None:
+        return mesh
+    primitive["targets"], dense = [], np.zeros((clip.mesh.vertex_count, 3), np.float32)
+    for index in range(len(clip.shapes)):
+        ids, offsets = clip.shapes.target(index)
+        dense[ids] = offsets
+        moved = np.flatnonzero(np.isin(sources, ids))
+        added = buffer.add_sparse(moved, dense[sources[moved]], count=len(sources))
+        primitive["targets"].append({"POSITION": added})
+    names = [f"Corrective{index:03d}" for index in range(len(clip.shapes))]
+    return mesh | {"weights": [0.0] * len(names), "extras": {"targetNames": names}}
+
+
+def _primitive(
+    clip: SkinnedClip, buffer: GlbBuffer, sources: np.ndarray, uv: np.ndarray, triangles: np.ndarray
+) -> dict[str, Any]:
     normals = vertex_normals(clip.rest, clip.mesh.triangles)
     attributes = {
         "POSITION": buffer.add(clip.rest[sources].astype(np.float32), role="attribute", bounds=True),
@@ -196,6 +216,10 @@ def _animation(clip: SkinnedClip, buffer: GlbBuffer) -> dict[str, Any]:
             channels.append({"sampler": len(samplers), "target": {"node": int(joint) + 1, "path": kind}})
             output = buffer.add(np.ascontiguousarray(values[:, joint], np.float32))
             samplers.append({"input": times, "interpolation": "LINEAR", "output": output})
+    if clip.shapes is not None:
+        channels.append({"sampler": len(samplers), "target": {"node": 0, "path": "weights"}})
+        output = buffer.add(np.ascontiguousarray(clip.shapes.weights.ravel(), np.float32))
+        samplers.append({"input": times, "interpolation": "LINEAR", "output": output})
     if not channels:  # glTF forbids an empty animation: say explicitly that Hips rest.
         output = buffer.add(np.ascontiguousarray(clip.quaternions[:, 0], np.float32))
         channels = [{"sampler": 0, "target": {"node": 1, "path": "rotation"}}]

@@ -25,7 +25,8 @@ def write_usd(path: str | Path, clip: SkinnedClip) -> None:
     """Write `clip` as UsdSkel: metres, +Y up, one time code a frame, the T-pose as rest.
 
     The skeleton holds the identity's bind and T-pose transforms, the animation is separate from them, and
-    the mesh keeps every skin influence and its UVs. `clip.metadata` goes to the layer's custom data.
+    the mesh keeps every skin influence and its UVs; correctives are blend shapes. `clip.metadata` goes to the
+    layer's custom data.
 
     Args:
         path: ``.usdc`` (binary, a third of the size), ``.usda`` (text) or ``.usd``.
@@ -94,7 +95,7 @@ def _set_up(stage: Any, *, frame_count: int, fps: float, metres: float = 1.0, up
 
 def _stage(clip: SkinnedClip) -> Any:
     """Build the stage in memory."""
-    from pxr import Usd, UsdSkel
+    from pxr import Usd, UsdGeom, UsdSkel
 
     stage = Usd.Stage.CreateInMemory()
     _set_up(stage, frame_count=clip.frame_count, fps=clip.fps)
@@ -105,7 +106,12 @@ def _stage(clip: SkinnedClip) -> Any:
     _add_skeleton(stage, f"{scope}/Skeleton", clip)
     mesh = _add_mesh(stage, f"{scope}/Mesh", clip)
     _bind(mesh, f"{scope}/Skeleton", clip)
+    if clip.shapes is not None:
+        _add_shapes(stage, mesh, f"{scope}/Skeleton/Animation", clip)
     _add_material(stage, mesh, f"{scope}/Material", clip)
+    extent = root.CreateExtentAttr()
+    for frame in range(clip.frame_count):
+        extent.Set(UsdGeom.Boundable.ComputeExtentFromPlugins(root, frame), frame)
     return stage
 
 
@@ -201,6 +207,27 @@ def _bind(mesh: Any, skeleton: str, clip: SkinnedClip) -> None:
     binding.CreateJointWeightsPrimvar(constant=False, elementSize=width).Set(
         Vt.FloatArray.FromNumpy(weights.reshape(-1))
     )
+
+
+def _add_shapes(stage: Any, mesh: Any, animation: str, clip: SkinnedClip) -> None:
+    """Correctives as blend shapes, whose weights the animation moves."""
+    from pxr import UsdSkel, Vt
+
+    assert clip.shapes is not None
+    names = [f"Corrective{index:03d}" for index in range(len(clip.shapes))]
+    for index, name in enumerate(names):
+        ids, offsets = clip.shapes.target(index)
+        shape = UsdSkel.BlendShape.Define(stage, f"{mesh.GetPath()}/{name}")
+        shape.CreateOffsetsAttr(Vt.Vec3fArray.FromNumpy(offsets))
+        shape.CreatePointIndicesAttr(_ints(ids))
+    binding = UsdSkel.BindingAPI(mesh.GetPrim())
+    binding.CreateBlendShapesAttr(names)
+    binding.CreateBlendShapeTargetsRel().SetTargets([f"{mesh.GetPath()}/{name}" for name in names])
+    moved = UsdSkel.Animation.Get(stage, animation)
+    moved.CreateBlendShapesAttr(names)
+    weights = moved.CreateBlendShapeWeightsAttr()
+    for frame, row in enumerate(clip.shapes.weights):
+        weights.Set(Vt.FloatArray.FromNumpy(np.ascontiguousarray(row)), frame)
 
 
 def _add_material(stage: Any, mesh: Any, path: str, clip: SkinnedClip) -> None:

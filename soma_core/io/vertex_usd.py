@@ -23,7 +23,7 @@ class UsdSequence(VertexSequence):
 
     Raises:
         AssetError: not a USD file.
-        InputError: no mesh or several that move, blend shapes, or samples at uneven times.
+        InputError: no mesh or several that move, blend shapes with inbetweens, or samples at uneven times.
     """
 
     def __init__(self, path: Path) -> None:
@@ -32,6 +32,7 @@ class UsdSequence(VertexSequence):
         with _usd_errors(path):
             self._stage = Usd.Stage.Open(str(path))
             self._points, self._skin, times = _moving_mesh(path, self._stage)
+            self._shapes = None if self._skin is None else _BlendShapes.of(path, *self._skin)
         self._times = times or [self._stage.GetStartTimeCode()]
         rate = self._stage.GetTimeCodesPerSecond()
         super().__init__(
@@ -61,6 +62,8 @@ class UsdSequence(VertexSequence):
         prim = self._points.GetPrim()
         if self._skin is not None:
             query, skeleton = self._skin
+            if self._shapes is not None:
+                points = self._shapes.added(np.array(points), time)
             if not query.ComputeSkinnedPoints(skeleton.ComputeSkinningTransforms(time), points, time):
                 cause = f"the joint indices or weights of {prim.GetPath()} do not fit its skeleton"
                 raise AssetError(self.path, cause=cause, fix="Export the skin again.")
@@ -72,6 +75,61 @@ class UsdSequence(VertexSequence):
     def close(self) -> None:
         """Let go of the stage."""
         self._skin = self._points = self._stage = None
+
+
+class _BlendShapes:
+    """Offsets that an animation adds to points before they are skinned.
+
+    Args:
+        shapes: vertices (n,) and offsets (n, 3) of each.
+        animation: query of the animation, and `order`, the place of each shape among its weights.
+    """
+
+    def __init__(
+        self, path: Path, shapes: list[tuple[np.ndarray, np.ndarray]], animation: Any, order: list[int]
+    ) -> None:
+        self._path, self._shapes, self._animation, self._order = path, shapes, animation, order
+
+    @classmethod
+    def of(cls, path: Path, query: Any, skeleton: Any) -> _BlendShapes | None:
+        """Those of a skinned mesh; None where nothing moves any."""
+        from pxr import UsdSkel
+
+        animation = skeleton.GetAnimQuery()
+        if not (query.HasBlendShapes() and animation):
+            return None
+        names = list(query.GetBlendShapeOrder())
+        known = list(animation.GetBlendShapeOrder())
+        places = query.GetBlendShapeTargetsRel().GetTargets()
+        shapes, order = [], []
+        for name, place in zip(names, places, strict=True):
+            shape = UsdSkel.BlendShape(query.GetPrim().GetStage().GetPrimAtPath(place))
+            if shape.GetInbetweens():
+                raise InputError(
+                    f"{path}: {place}", got="inbetweens", expected="plain blend shapes",
+                    fix="Bake the deformation into points, one time sample a frame.",
+                )  # fmt: skip
+            if name in known:
+                offsets = np.array(shape.GetOffsetsAttr().Get() or np.zeros((0, 3)), np.float64)
+                ids = shape.GetPointIndicesAttr().Get()
+                ids = np.arange(len(offsets)) if not ids else np.array(ids, np.int64)
+                shapes.append((ids, offsets.reshape(-1, 3)))
+                order.append(known.index(name))
+        return cls(path, shapes, animation, order) if shapes else None
+
+    def added(self, points: np.ndarray, time: float) -> Any:
+        """Points (v, 3) with the offsets of a time code."""
+        from pxr import Vt
+
+        weights = np.array(self._animation.ComputeBlendShapeWeights(time), np.float64)
+        points = points.astype(np.float64)
+        for (ids, offsets), place in zip(self._shapes, self._order, strict=True):
+            if len(ids) != len(offsets) or (len(ids) and not 0 <= ids.min() <= ids.max() < len(points)):
+                cause = "the points of a blend shape do not fit its mesh"
+                raise AssetError(self._path, cause=cause, fix="Export the blend shapes again.")
+            if weights[place]:
+                np.add.at(points, ids, weights[place] * offsets)
+        return Vt.Vec3fArray.FromNumpy(points.astype(np.float32))
 
 
 @contextmanager
@@ -107,13 +165,6 @@ def _moving_mesh(path: Path, stage: Any) -> tuple[Any, Any, list[float]]:
             fix="Export the body alone.",
         )
     mesh, skin, times = moving[0]
-    if skin is not None and skin[0].HasBlendShapes():
-        raise InputError(
-            f"{path}: {mesh.GetPath()}",
-            got="blend shapes",
-            expected="skinning or points at each time",
-            fix="Bake the deformation into points, one time sample a frame.",
-        )
     return mesh, skin, times
 
 

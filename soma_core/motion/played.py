@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import functools
+import logging
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from soma_core.animation.engine import Body
+from soma_core.animation.kinematics import relative_from_absolute
+from soma_core.correctives.shapes import CorrectiveShapes, corrective_shapes
 from soma_core.io.clip import SkinnedClip, skinned_clip, t_pose_world
 from soma_core.io.joint_files import JointFrames, JointPiece, chosen_joints
 from soma_core.io.motion import Motion
@@ -21,6 +24,8 @@ from soma_core.topology.frames import native_to_canonical
 from soma_core.view.picture import backend_colour
 
 __all__ = ["Played"]
+
+_log = logging.getLogger(__name__)
 
 _CHUNK = 64
 """Frames posed at once: 18,056 vertices of 64 frames in float32 are 14 MB."""
@@ -82,11 +87,25 @@ class Played:
             world = self.transforms(frames)
             parts.append(world.cpu().numpy())
             helpers.append(layer.helper_transforms(self.identity, world).cpu().numpy())
-        return skinned_clip(
+        made = skinned_clip(
             layer.mesh, layer.rig, self.identity, np.concatenate(parts), fps=self.motion.fps,
             helpers=np.concatenate(helpers) if layer.procedural else None,
-            colour=backend_colour(layer.backend), metadata=metadata,
+            colour=backend_colour(layer.backend), metadata=metadata, shapes=self._shapes(),
         )  # fmt: skip
+        for text in made.limits.values():
+            _log.info("skinned files: %s", text)
+        return replace(made, metadata=made.metadata | made.limits)
+
+    def _shapes(self) -> CorrectiveShapes | None:
+        """What the correctives add, for files that skin."""
+        layer = self.layer
+        if layer.correctives is None:
+            return None
+        identity, rotations, _ = self._body(slice(None))
+        if self._absolute:
+            axes = layer.animation.kinematics
+            rotations = relative_from_absolute(rotations, axes.orient[1:], axes.parent_orient[1:])
+        return corrective_shapes(layer.correctives, rotations, identity.bind_world)
 
     @property
     def _absolute(self) -> bool:

@@ -7,6 +7,7 @@ import pytest
 import scipy.sparse
 from scipy.spatial.transform import Rotation
 
+from soma_core.correctives.shapes import CorrectiveShapes
 from soma_core.io.clip import skinned_clip
 from soma_core.rig.mesh import CanonicalMesh
 from soma_core.rig.skeleton import Rig
@@ -28,9 +29,10 @@ def forward(parents, local):
 def skin(clip, world):
     """Linear blend skinning, (frames, v, 3)."""
     matrices = world @ np.linalg.inv(clip.bind_world)
-    rest = np.concatenate([clip.rest, np.ones((len(clip.rest), 1))], axis=1)
+    moved = clip.rest + (clip.shapes.weights @ clip.shapes.targets).reshape(len(world), -1, 3)
+    rest = np.concatenate([moved, np.ones((*moved.shape[:2], 1))], axis=2)
     weights = clip.rig.weights.toarray()
-    return np.einsum("vj,fjab,vb->fva", weights, matrices, rest)[..., :3]
+    return np.einsum("vj,fjab,fvb->fva", weights, matrices, rest)[..., :3]
 
 
 def _tube():
@@ -111,6 +113,13 @@ def clip():
     local[:, 1:, :3, 3] = (inverse @ bind[1:])[:, :3, 3]
     local[:, 1, :3, 3] = [3.0, 0.9, -2.0] + np.linspace(0, 1, 9)[:, None] * [0.4, 0.1, 1.0]
     identity = SimpleNamespace(rest=1.1 * mesh.vertices[None], bind_world=bind[None])
+    targets = generator.normal(scale=0.02, size=(3, mesh.vertex_count, 3))
+    targets[generator.uniform(size=targets.shape[:2]) < 0.6] = 0  # shapes move some of the vertices
+    shapes = CorrectiveShapes(
+        targets=scipy.sparse.csr_array(targets.reshape(3, -1)),
+        weights=generator.uniform(-1, 1, size=(9, 3)).astype(np.float32),
+        worst=0.0,
+    )
     return skinned_clip(
         mesh,
         rig,
@@ -119,6 +128,7 @@ def clip():
         fps=30,
         name="Toy body",
         metadata={"licence": "CC0-1.0", "backend": "toy"},
+        shapes=shapes,
     )
 
 

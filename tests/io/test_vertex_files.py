@@ -378,7 +378,8 @@ def test_a_glb_of_another_kind_says_why(tmp_path, vertices, changes, said):
     ("accessor", "said"),
     [
         ({"count": 10**12}, "strides is incompatible|too small"),
-        ({"sparse": {}}, "is sparse"),
+        ({"sparse": {}}, "KeyError"),
+        ({"bufferView": None, "count": 10**12}, "take 12000000000000 bytes|NoneType"),
         ({"bufferView": 9}, "IndexError"),
         ({"componentType": 1}, "KeyError"),
     ],

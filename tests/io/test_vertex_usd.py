@@ -93,18 +93,14 @@ def test_a_vertex_count_that_changes_is_refused(tmp_path, vertices):
         sequence.read(0, 4)
 
 
-def test_blend_shapes_are_refused(tmp_path, clip):
-    from pxr import Usd, UsdSkel, Vt
+def test_inbetweens_of_blend_shapes_are_refused(tmp_path, clip):
+    from pxr import Usd, UsdSkel
 
     write_usd(tmp_path / "a.usda", clip)
     stage = Usd.Stage.Open(str(tmp_path / "a.usda"))
-    mesh = stage.GetPrimAtPath("/Toy_body/Mesh")
-    UsdSkel.BlendShape.Define(stage, "/Toy_body/Mesh/smile").CreateOffsetsAttr([(0, 0, 1)])
-    binding = UsdSkel.BindingAPI(mesh)
-    binding.CreateBlendShapesAttr(Vt.TokenArray(["smile"]))
-    binding.CreateBlendShapeTargetsRel().SetTargets(["/Toy_body/Mesh/smile"])
+    UsdSkel.BlendShape.Get(stage, "/Toy_body/Mesh/Corrective001").CreateInbetween("half")
     stage.GetRootLayer().Save()
-    with pytest.raises(InputError, match=r"/Toy_body/Mesh: got blend shapes"):
+    with pytest.raises(InputError, match=r"/Toy_body/Mesh/Corrective001: got inbetweens"):
         open_vertex_sequence(tmp_path / "a.usda")
 
 
