@@ -59,4 +59,4 @@ def run(config: DictConfig, output: Path) -> None:
         played, options.write, lambda product: output / WRITERS[product].file,
         options=options, picture=options.picture,
     )  # fmt: skip
-    _log.info("wrote %s", ", ".join(sorted(written)) or "nothing")
+    _log.info("wrote %s", ", ".join(place.name for place in written.values()) or "nothing")

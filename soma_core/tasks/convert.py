@@ -41,8 +41,7 @@ def run(config: DictConfig, output: Path) -> None:
         else:
             found = convert_file(path, output, options=options)
             _log.info("%s: %s", path.name, found)
-            for product, place in found.written.items():
-                _log.info("%s: %s", product, place)
+            _log.info("wrote %s", ", ".join(place.name for place in found.written.values()))
     except KeyboardInterrupt:
         _log.warning("stopped; the same command with out=%s goes on from here", output)
         raise
@@ -59,7 +58,7 @@ def _say(folder: Path, found: FolderConverted, report: Path) -> None:
     _log.info("%s: %s", folder, told)
     places = {name: place for each in found.converted.values() for name, place in each.written.items()}
     if places:
-        _log.info("wrote %s into %s", ", ".join(places), report.parent)
+        _log.info("wrote %s for each of them", ", ".join(places))
     if len(found.skipped) == len(found):
         raise InputError(
             str(folder), got=f"{len(found)} files without a motion", expected="motion files",
