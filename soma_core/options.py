@@ -178,6 +178,10 @@ class Options:
         for name, hint in get_type_hints(type(self)).items():
             value = vars(self).get(name)
             for kind in (hint, *get_args(hint)):
+                inner = get_args(kind)[0] if get_origin(kind) is list else None
+                if isinstance(inner, type) and issubclass(inner, StrEnum) and isinstance(value, list | tuple):
+                    value = [_member(name, inner, each) for each in value]
+                    object.__setattr__(self, name, value)
                 if isinstance(kind, type) and issubclass(kind, StrEnum) and isinstance(value, str):
                     value = _member(name, kind, value)
                     object.__setattr__(self, name, value)
@@ -197,8 +201,8 @@ def _fits(value: object, hint: Any) -> bool:
     return False
 
 
-def _member(name: str, kind: type[StrEnum], value: str) -> StrEnum:
-    if value not in list(kind):
+def _member(name: str, kind: type[StrEnum], value: object) -> StrEnum:
+    if not isinstance(value, str) or value not in list(kind):
         raise InputError(name, got=repr(value), expected=f"one of {', '.join(kind)}", fix="Correct the name.")
     return kind(value)
 

@@ -76,8 +76,8 @@ PUBLIC_NAMES = {
     "soma_core.motion": """
         Animated BackendChoice ConvertOptions Converted FitOptions FitPlan FolderConverted FrameRange
         IdentityChoice
-        InversionChoice InvertOptions Picture animate convert convert_file convert_folder finish_fit
-        fit_chunks invert layout_of load_clip plan_fit read stored_identity write
+        InversionChoice InvertOptions Picture Played WriteOptions animate convert convert_file convert_folder
+        finish_fit fit_chunks invert layout_of load_clip plan_fit read stored_identity write write_products
     """,
     "soma_core.plugin": """
         API_VERSION Axis BackendSpec BrokenBackendError Check CheckFailedError ClosestFaces FileNeeded

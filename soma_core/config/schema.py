@@ -6,10 +6,10 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from hydra.core.config_store import ConfigStore
-from omegaconf import MISSING
+from omegaconf import MISSING, OmegaConf
 
 from soma_core.motion.options import ConvertOptions, InvertOptions
-from soma_core.motion.writers import WriteOptions
+from soma_core.motion.writers import WriteOptions, listed_writers
 from soma_core.options import (
     BackendChoice,
     FitLod,
@@ -191,8 +191,16 @@ class WrapConfig:
     picture: bool = True
 
 
+def _listed_products(program: str) -> str:
+    """What a help text says of ``write=``, for the commands that have it."""
+    if program not in ("soma animate", "soma convert"):
+        return ""
+    return f"Products, write=[NAME,...]:\n{listed_writers()}\n\n"
+
+
 def register_schemas() -> None:
     """Make the schemas known to hydra under ``<task>_schema``; safe to call again."""
+    OmegaConf.register_new_resolver("soma_products", _listed_products, replace=True)
     store = ConfigStore.instance()
     for task, schema in (
         ("animate", AnimateConfig),

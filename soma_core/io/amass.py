@@ -21,6 +21,7 @@ __all__ = [
     "holds_smpl_motion",
     "read_amass",
     "write_amass",
+    "write_smplx",
 ]
 
 SmplName = Literal["smpl", "smplh", "smplx"]
@@ -31,6 +32,16 @@ SMPL_JOINTS: dict[SmplName, int] = {"smpl": 24, "smplh": 52, "smplx": 55}
 
 _PARTS = {"root_orient": 3, "pose_body": 63, "pose_jaw": 3, "pose_eye": 6, "pose_hand": 90}
 """Keys that SMPL-X files split the pose into, in the order of the joints, and their widths."""
+
+_HANDS = {"left_hand_pose": 45, "right_hand_pose": 45}
+_SMPLX_PARTS: dict[SmplName, dict[str, int]] = {
+    "smpl": {"global_orient": 3, "body_pose": 69},
+    "smplh": {"global_orient": 3, "body_pose": 63, **_HANDS},
+    "smplx": {"global_orient": 3, "body_pose": 63, "jaw_pose": 3, "leye_pose": 3, "reye_pose": 3, **_HANDS},
+}
+"""Arguments of each model in its own code, in the order of the joints, and their widths."""
+
+_EXPRESSIONS = 10
 
 _RATES = ("mocap_framerate", "mocap_frame_rate", "fps")
 _SECONDS = "mocap_time_length"
@@ -231,6 +242,44 @@ def write_amass(
         values["num_betas"] = len(motion.betas)
     else:
         values["mocap_framerate"] = motion.fps
+    _write(path, values, extra)
+
+
+def write_smplx(
+    motion: SmplMotion, path: str | Path, *, extra: Mapping[str, np.ndarray] | None = None
+) -> None:
+    """Write `motion` under the names that the models' own code takes, atomically.
+
+    ``global_orient`` (frames, 3), ``body_pose`` (frames, 69 for SMPL, else 63), ``transl`` (frames, 3),
+    ``betas`` (1, k); for SMPL-X ``jaw_pose``, ``leye_pose``, ``reye_pose`` and an ``expression`` of zeros
+    (frames, 10); with hands ``left_hand_pose`` and ``right_hand_pose`` (frames, 45). ``flat_hand_mean`` and
+    ``use_pca`` say how a model has to be made for them; also ``gender``, ``fps``, ``surface_model_type``.
+
+    Args:
+        motion: what to write; its world is kept as it is.
+        path: the NPZ file.
+        extra: further arrays under names of their own.
+
+    Raises:
+        InputError: as :func:`write_amass`.
+    """
+    poses = motion.rotations.reshape(motion.frame_count, -1)
+    values: dict[str, object] = {}
+    end = 0
+    for name, width in _SMPLX_PARTS[motion.model].items():
+        values[name] = poses[:, end : end + width]
+        end += width
+    values |= {"transl": motion.translation, "betas": motion.betas[None]}
+    if motion.model == "smplx":
+        values["expression"] = np.zeros((motion.frame_count, _EXPRESSIONS), np.float32)
+    if motion.model != "smpl":
+        values |= {"flat_hand_mean": True, "use_pca": False}
+    values |= {"gender": motion.gender, "surface_model_type": motion.model, "fps": motion.fps}
+    _write(path, values, extra)
+
+
+def _write(path: str | Path, values: dict[str, object], extra: Mapping[str, np.ndarray] | None) -> None:
+    """Write the values of a layout and what is beside it."""
     for name, array in (extra or {}).items():
         if name in values or np.asarray(array).dtype.hasobject:
             got = f"{name!r}, which the layout has" if name in values else f"Python objects under {name!r}"

@@ -17,6 +17,8 @@ if TYPE_CHECKING:
     from soma_core.motion.fit_job import FitPlan, fit_chunks
     from soma_core.motion.identities import stored_identity
     from soma_core.motion.options import ConvertOptions, FitOptions, InvertOptions
+    from soma_core.motion.played import Played
+    from soma_core.motion.writers import WriteOptions, write_products
     from soma_core.options import BackendChoice, FrameRange, IdentityChoice, InversionChoice, Picture
 
 __all__ = [
@@ -32,6 +34,8 @@ __all__ = [
     "InversionChoice",
     "InvertOptions",
     "Picture",
+    "Played",
+    "WriteOptions",
     "animate",
     "convert",
     "convert_file",
@@ -45,6 +49,7 @@ __all__ = [
     "read",
     "stored_identity",
     "write",
+    "write_products",
 ]
 
 _HOMES = {
@@ -55,6 +60,8 @@ _HOMES = {
     "soma_core.motion.fit_job": ["FitPlan", "fit_chunks"],
     "soma_core.motion.identities": ["stored_identity"],
     "soma_core.motion.options": ["ConvertOptions", "FitOptions", "InvertOptions"],
+    "soma_core.motion.played": ["Played"],
+    "soma_core.motion.writers": ["WriteOptions", "write_products"],
     "soma_core.options": ["BackendChoice", "FrameRange", "IdentityChoice", "InversionChoice", "Picture"],
 }
 

@@ -143,13 +143,14 @@ def _smpl_body(path: Path, options: ConvertOptions, backends: FitBackends) -> Sh
 
 
 def _usable_betas(path: Path, motion: SmplMotion, spec: BackendSpec, most: int | None) -> list[float]:
-    """Shape coefficients for the user's model file, without zeros at the end.
+    """Shape coefficients for the user's model file, as many as the file has; zeros that it has not are cut.
 
     Raises:
         InputError: the model file has fewer shape directions.
     """
-    betas = np.trim_zeros(motion.betas[:most].astype(np.float64), "b")
+    betas = motion.betas[:most].astype(np.float64)
     (width,) = spec.params[0].shape
+    betas = betas[: max(width, len(np.trim_zeros(betas, "b")))]
     if len(betas) > width:
         raise InputError(
             f"{path}: betas",

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import logging
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +19,7 @@ from soma_core.motion.files import Layout, ResultFiles, layout_of, read, write
 from soma_core.motion.fit_job import FitJob, FitPlan, fit_settings, plan_body
 from soma_core.motion.models import FitBackends
 from soma_core.motion.options import ConvertOptions, InvertOptions
+from soma_core.motion.products import BodyProducts
 
 __all__ = ["Converted", "Converter", "earlier_report", "finish_fit", "invert", "plan_fit"]
 
@@ -34,12 +35,14 @@ class Converted:
         files: where the results lie.
         earlier: whether an earlier run made it.
         vertices: whether they are the result, and no motion.
+        written: the results, by what they are.
     """
 
     report: Mapping[str, Any]
     files: ResultFiles
     earlier: bool = False
     vertices: bool = False
+    written: Mapping[str, Path] = field(default_factory=dict)
 
     def motion(self) -> Motion:
         """Read the motion that came out.
@@ -75,6 +78,7 @@ class Converter:
 
     def __init__(self, options: ConvertOptions) -> None:
         self._options, self._backends = options, FitBackends(options)
+        self._products = BodyProducts(options) if options.shown else None
 
     def __call__(self, path: Path, files: ResultFiles, chunks: Path) -> Converted:
         """Convert a file.
@@ -90,12 +94,28 @@ class Converter:
             SomaError: the file, or the backend that it needs, cannot be used.
             InputError: it holds no motion, or was fitted before with other settings.
         """
+        before = _products_before(files.report)
         layout = _known_layout(path)
-        if layout not in FITTED:
-            return self._carry_over(path, layout, files)
+        fitted = layout in FITTED
+        if fitted:
+            _refuse_chosen(path, self._options)
+            found = self._fitted(path, layout, files, chunks)
+        else:
+            found = self._carry_over(path, layout, files)
+        written = {"npz": files.motion}
+        if self._products is not None:
+            report = dict(found.report)
+            written |= self._products(path, files, report, before, fitted=fitted)
+            found = replace(found, report=report)
+        return replace(found, written=written)
+
+    def _fitted(self, path: Path, layout: Layout, files: ResultFiles, chunks: Path) -> Converted:
+        """Fit the body of a file, or find that it was."""
         options = self._options
         body = open_body(path, layout, options, self._backends)
-        earlier = earlier_report(files.report, files.motion, fit_settings(path, layout, body, options))
+        earlier = earlier_report(
+            files.report, {"npz": files.motion}, fit_settings(path, layout, body, options)
+        )
         if earlier is not None:
             _refuse_failed(path, earlier, files.report)
             return Converted(report=earlier, files=files, earlier=True)
@@ -114,6 +134,28 @@ class Converter:
         }
         atomic_text(files.report, json.dumps(report, indent=2) + "\n")
         return Converted(report=report, files=files)
+
+
+def _products_before(report: Path) -> Mapping[str, Any]:
+    """What an earlier report says of products; nothing where there is none of ours."""
+    try:
+        return dict(_read_report(report)["products"])
+    except (OSError, ValueError, KeyError, TypeError):
+        return {}
+
+
+def _refuse_chosen(path: Path, options: ConvertOptions) -> None:
+    """Refuse a backend for a file that tells its own body; that of SAM 3D Body may need options.
+
+    Raises:
+        InputError: one was chosen.
+    """
+    chosen = options.backend
+    if chosen is not None and chosen.name != "mhr" and options.identity.method == "known":
+        raise InputError(
+            "backend", got=chosen.name, expected=f"none: {path.name} tells whose body it shows",
+            fix="Convert it first; then soma animate motion=FILE shows it on another body.",
+        )  # fmt: skip
 
 
 def _known_layout(path: Path) -> Layout:
@@ -210,13 +252,15 @@ def _finished(job: FitJob) -> Converted:
     return Converted(report=report, files=plan.files)
 
 
-def earlier_report(file: Path, result: Path, settings: Mapping[str, Any]) -> dict[str, Any] | None:
-    """The report `file` if an earlier run left it and `result`, with the same settings for the same input.
+def earlier_report(
+    file: Path, results: Mapping[str, Path], settings: Mapping[str, Any]
+) -> dict[str, Any] | None:
+    """The report `file` if an earlier run left it and `results`, with the same settings for the same input.
 
     Raises:
         InputError: the earlier run had other settings.
     """
-    if not (file.is_file() and result.is_file()):
+    if not file.is_file() or not all(result.exists() for result in results.values()):
         return None
     try:
         report = _read_report(file)

@@ -14,7 +14,8 @@ from soma_core.io.motion_files import read_motion, write_motion
 from soma_core.io.npz_fields import open_npz
 from soma_core.io.sam3d import SAM3D_SUFFIXES
 from soma_core.io.soma_npz import METRES_PER_UNIT
-from soma_core.options import LengthUnit
+from soma_core.motion.writers import WRITERS
+from soma_core.options import LengthUnit, Product
 from soma_core.rig import load_canonical
 from soma_core.topology.frames import METRES
 
@@ -28,10 +29,14 @@ SUFFIXES = SAM3D_SUFFIXES
 
 @dataclass(frozen=True, kw_only=True)
 class ResultFiles:
-    """Where results go: motions, or vertices where there are no motions to be had."""
+    """Where results go: motions, reports and what shows how good a fit is.
 
+    Other products go into `folder`, or for the file `name` of a folder into ``folder/PRODUCT/name``.
+    """
+
+    folder: Path
+    name: str | None = None
     motion: Path
-    vertices: Path
     frames: Path
     report: Path
     picture: Path
@@ -40,8 +45,8 @@ class ResultFiles:
     def of_folder(cls, folder: Path) -> ResultFiles:
         """The usual names in a folder of their own."""
         return cls(
+            folder=folder,
             motion=folder / "motion.npz",
-            vertices=folder / "vertices.npz",
             frames=folder / "frames.npz",
             report=folder / "report.json",
             picture=folder / "errors.png",
@@ -49,17 +54,24 @@ class ResultFiles:
 
     @classmethod
     def mirrored(cls, folder: Path, name: str) -> ResultFiles:
-        """Those of the file `name` of a folder: ``motions``, ``vertices`` and ``reports`` mirror it."""
+        """Those of the file `name` of a folder: ``motions``, ``reports`` and so on mirror it."""
         if not name.lower().endswith(".npz"):
             name = f"{name}.npz"
         report = folder / "reports" / name
         return cls(
+            folder=folder,
+            name=name[:-4],
             motion=folder / "motions" / name,
-            vertices=folder / "vertices" / name,
             frames=report.with_suffix(".frames.npz"),
             report=report.with_suffix(".json"),
             picture=report.with_suffix(".png"),
         )
+
+
+    def product(self, product: Product) -> Path:
+        """Where a product goes."""
+        file = Path(WRITERS[product].file)
+        return self.folder / file if self.name is None else self.folder / product / (self.name + file.suffix)
 
 
 def layout_of(path: str | Path) -> Layout | None:

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
+import logging
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
@@ -12,19 +14,25 @@ import torch
 from torch import Tensor
 
 from soma_core.cache import atomic_write
-from soma_core.io.amass import Gender, SmplMotion, SmplName, write_amass
-from soma_core.io.npz_parts import write_npz_parts
-from soma_core.io.soma_npz import METRES_PER_UNIT
+from soma_core.io.amass import Gender, SmplMotion, SmplName, write_amass, write_smplx
 from soma_core.io.vertex_sequence import UpAxis
+from soma_core.io.vertex_writers import MeshFrames
 from soma_core.motion.chunks import FittedChunks
 from soma_core.motion.files import ResultFiles
 from soma_core.motion.native_errors import NativeErrors
+from soma_core.motion.writers import WRITERS
 from soma_core.native import NativeFit, NativeTransfer
+from soma_core.options import Product
 from soma_core.topology.frames import METRES, native_to_canonical
 
 __all__ = ["NativeTarget", "SmplTarget", "VertexTarget"]
 
+_log = logging.getLogger(__name__)
+
 _PER_FRAME = ("valid", "converged", "iterations", "mean_error", "largest_error")
+_USUAL_BETAS, _MOST_USUAL_BETAS = 10, 16
+"""Coefficients that the models' own code takes unless told otherwise, and as many as files of AMASS hold."""
+
 _SUMMED = ("sums", "numbers", "counts", "maxima")
 
 
@@ -34,6 +42,10 @@ class NativeTarget(Protocol):
     @property
     def facts(self) -> Mapping[str, Any]:
         """What decides the result, for the report."""
+        ...
+
+    def results(self, files: ResultFiles) -> dict[str, Path]:
+        """What is written, and where."""
         ...
 
     def arrays(self, vertices: Tensor) -> dict[str, np.ndarray]:
@@ -51,9 +63,11 @@ class VertexTarget:
 
     Attributes:
         transfer: to that topology.
+        products: as what they are written.
     """
 
     transfer: NativeTransfer
+    products: tuple[Product, ...] = (Product.vertices,)
 
     @property
     def facts(self) -> Mapping[str, Any]:
@@ -61,14 +75,26 @@ class VertexTarget:
         spec = self.transfer.spec
         return {"to": spec.name, "unit": spec.unit, "up": spec.up}
 
+    def results(self, files: ResultFiles) -> dict[str, Path]:
+        """A file or a folder for each product."""
+        return {str(product): files.product(product) for product in self.products}
+
     def arrays(self, vertices: Tensor) -> dict[str, np.ndarray]:
         """The vertices."""
         return {"vertices": self.transfer(vertices).float().cpu().numpy()}
 
     def write(self, chunks: FittedChunks, files: ResultFiles, *, fps: float, source: str) -> dict[str, Any]:
-        """Write ``files.vertices``, which ``soma invert`` reads."""
-        _write_vertices(chunks, files, self.transfer, fps=fps, source=source, up=self.transfer.spec.up)
-        return {"frames": chunks.frame_count, "vertices": self.transfer.count}
+        """Write the products, for which the mesh is streamed chunk by chunk."""
+        transfer, triangles = self.transfer, self.transfer.triangles.cpu().numpy()
+        mesh = MeshFrames(
+            pieces=functools.partial(_column, chunks, "vertices"), frame_count=chunks.frame_count,
+            vertex_count=transfer.count, triangles=triangles, counts=np.full(len(triangles), 3),
+            indices=triangles.ravel(), fps=fps, metres=METRES[transfer.spec.unit], up=transfer.spec.up,
+            source=source,
+        )  # fmt: skip
+        for product in self.products:
+            WRITERS[product].write(files.product(product), mesh)
+        return {"frames": chunks.frame_count, "vertices": transfer.count}
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -81,6 +107,8 @@ class SmplTarget:
         model, gender: which it is.
         params: the body; None while it is yet to be found.
         up: upward axis of the world that is written.
+        width: shape coefficients that are written; None: those of the body, or of the model.
+        layout: ``amass`` or ``smplx``, the names of the keys.
     """
 
     fit: NativeFit
@@ -89,12 +117,36 @@ class SmplTarget:
     gender: Gender
     params: Mapping[str, list[float]] | None
     up: UpAxis
+    width: int | None = None
+    layout: str = "amass"
+
+    def __post_init__(self) -> None:
+        """Leave out coefficients that are not to be written: poses then make up for what they can."""
+        betas = (self.params or {}).get("betas", [])
+        left_out = np.abs(betas[self.width :]).max(initial=0) if self.width else 0
+        if left_out > 0:
+            _log.warning(
+                "num_betas=%d leaves out betas of up to %.2g; the body is the nearest without them",
+                self.width, left_out,
+            )  # fmt: skip
+            object.__setattr__(self, "params", {**(self.params or {}), "betas": betas[: self.width]})
+
+    def of_body(self, params: Mapping[str, list[float]]) -> SmplTarget:
+        """The same for a body that was found."""
+        return replace(self, params=params)
 
     @property
     def facts(self) -> Mapping[str, Any]:
         """The body and the world."""
         params = "found" if self.params is None else dict(self.params)
-        return {"to": self.model, "gender": self.gender, "params": params, "up": self.up}
+        return {
+            "to": self.model, "gender": self.gender, "params": params, "up": self.up,
+            "num_betas": self.width, "layout": self.layout,
+        }  # fmt: skip
+
+    def results(self, files: ResultFiles) -> dict[str, Path]:
+        """One file of poses."""
+        return {"npz": files.motion}
 
     def arrays(self, vertices: Tensor) -> dict[str, np.ndarray]:
         """Parameters of the frames, and statistics of the error."""
@@ -113,16 +165,24 @@ class SmplTarget:
         }
 
     def write(self, chunks: FittedChunks, files: ResultFiles, *, fps: float, source: str) -> dict[str, Any]:
-        """Write ``files.motion`` in the layout of AMASS, and ``files.frames``."""
+        """Write ``files.motion`` in the layout of AMASS or with the names of smplx, and ``files.frames``."""
         columns = {name: np.concatenate(list(_column(chunks, name))) for name in ("rotations", "translation")}
-        betas = np.array((self.params or {}).get("betas", []))
-        motion = SmplMotion(model=self.model, **columns, betas=betas, gender=self.gender, fps=fps, up=self.up)
-        write_amass(
-            motion, files.motion, extra={"source": np.array(source), "up_axis": np.array(self.up[1:].upper())}
+        motion = SmplMotion(
+            model=self.model, **columns, betas=self._betas(), gender=self.gender, fps=fps, up=self.up
         )
+        extra = {"source": np.array(source), "up_axis": np.array(self.up[1:].upper())}
+        (write_amass if self.layout == "amass" else write_smplx)(motion, files.motion, extra=extra)
         frames = {name: np.concatenate(list(_column(chunks, name))) for name in _PER_FRAME}
         atomic_write(files.frames, lambda path: np.savez_compressed(path, **frames))
         return self._figures(chunks, frames)
+
+    def _betas(self) -> np.ndarray:
+        """Coefficients of the width that is written, zeros at the end: other tools multiply all of them."""
+        own = np.array((self.params or {}).get("betas", []))
+        (width,) = self.fit.spec.params[0].shape
+        usual = len(own) if len(own) >= _USUAL_BETAS else min(max(width, _USUAL_BETAS), _MOST_USUAL_BETAS)
+        width = self.width or usual
+        return np.pad(own, (0, width - len(own)))
 
     def _figures(self, chunks: FittedChunks, frames: Mapping[str, np.ndarray]) -> dict[str, Any]:
         parts = [dict(zip(_SUMMED, arrays, strict=True)) for arrays in chunks.load_all(*_SUMMED)]
@@ -141,22 +201,3 @@ class SmplTarget:
 def _column(chunks: FittedChunks, name: str) -> Iterator[np.ndarray]:
     """One array of each chunk, in the order of the frames."""
     return (array for (array,) in chunks.load_all(name))
-
-
-def _write_vertices(
-    chunks: FittedChunks, files: ResultFiles, transfer: NativeTransfer, *, fps: float, source: str, up: str
-) -> None:
-    unit = next(name for name, length in METRES_PER_UNIT.items() if length == METRES[transfer.spec.unit])
-    arrays = {
-        "vertices": np.empty((0, transfer.count, 3), np.float32),
-        "triangles": transfer.triangles.cpu().numpy().astype(np.int32),
-        "fps": np.asarray(fps),
-        "unit": np.asarray(unit),
-        "source": np.asarray(source),
-    }
-    if up in ("+y", "+z"):
-        arrays["up_axis"] = np.asarray(up[1:].upper())
-    pieces: dict[str, Callable[[], Iterator[np.ndarray]]] = {
-        "vertices": functools.partial(_column, chunks, "vertices")
-    }
-    write_npz_parts(files.vertices, arrays, pieces, count=chunks.frame_count)

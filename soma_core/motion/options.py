@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 from soma_core.errors import InputError
+from soma_core.motion.writers import MESH_WRITERS, WriteOptions
 from soma_core.options import (
     BackendChoice,
     BodyGender,
@@ -16,6 +17,8 @@ from soma_core.options import (
     ModelOptions,
     Options,
     Picture,
+    Product,
+    SmplLayout,
     Topology,
     Translation,
     Upward,
@@ -79,39 +82,85 @@ class InvertOptions(FitOptions):
 
 
 @dataclass(kw_only=True)
-class ConvertOptions(FitOptions):
+class ConvertOptions(WriteOptions, FitOptions):
     """A conversion of other tools' motions to this skeleton, or back.
 
     Attributes:
-        backend: whose body moves, on the way back; in whose shapes an unknown body is sought.
-        to: ``soma`` for this skeleton, else the backend to go back to.
+        backend: whose body moves, on the way back and in what is written of a body; in whose shapes an
+            unknown body is sought.
+        to: ``soma`` for this skeleton, else the backend to go back to; or a product, as with `write`.
+        write: products, of ``soma_core.motion.writers``. To this skeleton they come beside the motion, which
+            is always written; on the way back they are meshes of the model. None: the motion, or what
+            `result` says.
         result: of the way back; None: poses of SMPL models, vertices of others.
         gender: of SMPL models; None: that of the file.
         most_betas: how many of a file's shape coefficients are used; None: all.
         betas: shape coefficients of the model, on the way back; None: the body's own, or the nearest.
-        translation: where the body stands, on the way back.
+        num_betas: how many are written; None: as many as the body's file or the model has, 10 at least.
+        layout: names of the keys that poses of SMPL models are written under; None: those of AMASS.
+        translation: where the body stands, on the way back and in what is written of a body.
     """
 
     to: str = "soma"
+    write: list[Product] | None = None
     result: ConvertResult | None = None
     gender: BodyGender | None = None
     most_betas: int | None = None
     betas: list[float] | None = None
+    num_betas: int | None = None
+    layout: SmplLayout | None = None
     translation: Translation = Translation.motion
 
     def __post_init__(self) -> None:
         """Refuse settings of the other direction, which would change nothing."""
         super().__post_init__()
+        if self.to in list(Product):
+            object.__setattr__(self, "write", [*(self.write or []), Product(self.to)])
+            object.__setattr__(self, "to", "soma")
+        if self.num_betas is not None and self.num_betas < 1:
+            raise InputError("num_betas", got=self.num_betas, expected="at least 1", fix="Try num_betas=10.")
         sought = None if self.identity.method == "known" else str(self.identity.method)
         unused: dict[str, object] = {"identity.method": sought, "most_betas": self.most_betas}
         why = f"to={self.to}"
         if self.to == "soma":
-            placed = None if self.translation == "motion" else str(self.translation)
-            unused = {"betas": self.betas, "result": self.result, "translation": placed}
-            if self.backend is not None and sought is None and self.backend.name != "mhr":
+            placed = None if self.translation == "motion" or self.shown else str(self.translation)
+            unused = {
+                "betas": self.betas, "num_betas": self.num_betas, "layout": self.layout,
+                "result": self.result, "translation": placed,
+            }  # fmt: skip
+            if self.backend is not None and sought is None and self.backend.name != "mhr" and not self.shown:
                 unused["backend"] = self.backend.name  # a file tells its own model
             why = "to=soma" if sought else "to=soma and identity=known"
         for name, value in unused.items():
             if value is not None:
                 fix = f"Leave {name.partition('.')[0]} out."
                 raise InputError(name, got=str(value), expected=f"none with {why}", fix=fix)
+        self._check_products()
+
+    @property
+    def shown(self) -> list[Product]:
+        """Products beside the motion, for which a body is posed."""
+        return [product for product in self.write or [] if product is not Product.npz]
+
+    def _check_products(self) -> None:
+        """Refuse products that the direction does not have, and settings that none of them takes.
+
+        Raises:
+            InputError: the first one.
+        """
+        if self.to == "soma":
+            self.refuse_unused(self.write or [Product.npz])
+            return
+        strange = [product for product in self.shown if product not in MESH_WRITERS]
+        mixed = self.shown and (Product.npz in (self.write or []) or self.result == "poses")
+        if strange or mixed:
+            raise InputError(
+                "write", got=strange[0] if strange else f"poses and {self.shown[0]}",
+                expected=f"with to={self.to}, npz for its poses, or its mesh: {', '.join(MESH_WRITERS)}",
+                fix="Leave to out for this skeleton." if strange else "Run it once for each.",
+            )  # fmt: skip
+        for name in ("joints", "camera", "write_up"):
+            if getattr(self, name) is not None:
+                raise InputError(
+                    name, got=str(getattr(self, name)), expected=f"none with to={self.to}", fix=f"Leave {name} out."
+                )

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import functools
 import logging
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -14,16 +16,22 @@ from torch import Tensor
 from soma_core.animation.engine import Body
 from soma_core.animation.kinematics import relative_from_absolute
 from soma_core.correctives.shapes import CorrectiveShapes, corrective_shapes
+from soma_core.errors import InputError
 from soma_core.io.clip import SkinnedClip, skinned_clip, t_pose_world
 from soma_core.io.joint_files import JointFrames, JointPiece, chosen_joints
 from soma_core.io.motion import Motion
+from soma_core.io.motion_files import check_rig
 from soma_core.io.vertex_writers import MeshFrames, canonical_frames
 from soma_core.layer import SomaLayer
+from soma_core.motion.animated import animate
+from soma_core.motion.identities import stored_identity
+from soma_core.motion.models import open_layer
+from soma_core.options import BackendChoice, ModelOptions
 from soma_core.skeleton.identity import Identity
 from soma_core.topology.frames import native_to_canonical
 from soma_core.view.picture import backend_colour
 
-__all__ = ["Played"]
+__all__ = ["MovingBodies", "Played"]
 
 _log = logging.getLogger(__name__)
 
@@ -136,3 +144,53 @@ class Played:
         """Some joints of world transforms (F, J, 4, 4), whose first is the virtual root."""
         shown = self._turn @ world[:, 1:][:, places, :3]
         return JointPiece(shown[..., 3], shown[..., :3])
+
+
+class MovingBodies:
+    """Bodies that motions move; layers that are made once serve all of them.
+
+    Args:
+        options: of the model.
+        chosen: whose body moves; None: that of each motion file.
+        translation: where it stands, as for ``animate``.
+    """
+
+    def __init__(self, options: ModelOptions, chosen: BackendChoice | None, translation: str) -> None:
+        self._options, self._chosen, self._translation = options, chosen, translation
+        self._layers: dict[str, SomaLayer] = {}
+
+    def layer_of(self, path: Path, motion: Motion) -> tuple[SomaLayer, Mapping[str, Any]]:
+        """The layer, and the identity as a motion file keeps it.
+
+        Args:
+            path: the motion's file, for messages.
+            motion: whose identity moves, unless one was chosen.
+
+        Raises:
+            InputError: none was chosen, and the file keeps none.
+        """
+        chosen, stored = self._chosen, motion.identity
+        if chosen is not None:
+            stored = {"backend": chosen.name, "params": chosen.params, "options": chosen.options}
+        elif "params" not in stored and "rest" not in stored:
+            raise InputError(
+                "backend",
+                got=f"none, and no body in {path.name}",
+                expected="whose body moves",
+                fix="Pass backend=NAME and backend.params.KEY=VALUE; backend=soma is a mean body.",
+            )
+        name, options = str(stored["backend"]), dict(stored.get("options", {}))
+        key = f"{name} {sorted(options.items())}"
+        if key not in self._layers:
+            self._layers[key] = open_layer(self._options, name, options)
+        return self._layers[key], stored
+
+    def played(self, layer: SomaLayer, stored: Mapping[str, Any], motion: Motion) -> Played:
+        """The motion on that body, where it is to stand."""
+        if not check_rig(motion, layer.rig.revision):
+            _log.info("the motion was made for rig %s; its relative rotations carry over", motion.rig_revision)
+        with torch.no_grad():
+            identity = stored_identity(layer, stored)
+            if self._translation != "motion":
+                motion = animate(layer, identity, motion, translation=self._translation).motion
+        return Played(layer=layer, identity=identity, motion=replace(motion, identity=stored))

@@ -177,7 +177,6 @@ def write_products(
         InputError: a joint that is none, or a camera that is none.
     """
     options, wanted, written = options or WriteOptions(), set(products), {}
-    options.refuse_unused(wanted)
     turned = replace(played, up=f"+{options.write_up or 'y'}")
     made: dict[str, tuple[Any, ...]] = {}
     for product, writer in WRITERS.items():

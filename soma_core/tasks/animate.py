@@ -41,6 +41,7 @@ def run(config: DictConfig, output: Path) -> None:
 
         draw_gallery(options, output / "gallery.png")
         return
+    options.refuse_unused(options.write)
     motion = load_clip(options.motion, fps=options.motion_fps, frames=options.frames)
     kept, chosen = options.identity_from == "motion", options.backend
     name, own = chosen.name, chosen.options
@@ -58,4 +59,4 @@ def run(config: DictConfig, output: Path) -> None:
         played, options.write, lambda product: output / WRITERS[product].file,
         options=options, picture=options.picture,
     )  # fmt: skip
-    _log.info("wrote %s", ", ".join(sorted(written)) or "nothing")
+    _log.info("wrote %s", ", ".join(place.name for place in written.values()) or "nothing")

@@ -39,7 +39,9 @@ def run(config: DictConfig, output: Path) -> None:
         if path.is_dir():
             _say(path, convert_folder(path, output, options=options), output / "report.json")
         else:
-            _log.info("%s: %s", path.name, convert_file(path, output, options=options))
+            found = convert_file(path, output, options=options)
+            _log.info("%s: %s", path.name, found)
+            _log.info("wrote %s", ", ".join(place.name for place in found.written.values()))
     except KeyboardInterrupt:
         _log.warning("stopped; the same command with out=%s goes on from here", output)
         raise
@@ -54,6 +56,9 @@ def _say(folder: Path, found: FolderConverted, report: Path) -> None:
     numbers = {"converted": found.converted, "skipped": found.skipped, "failed": found.errors}
     told = ", ".join(f"{len(names)} {state}" for state, names in numbers.items() if names)
     _log.info("%s: %s", folder, told)
+    places = {name: place for each in found.converted.values() for name, place in each.written.items()}
+    if places:
+        _log.info("wrote %s for each of them", ", ".join(places))
     if len(found.skipped) == len(found):
         raise InputError(
             str(folder), got=f"{len(found)} files without a motion", expected="motion files",

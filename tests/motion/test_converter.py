@@ -97,7 +97,7 @@ def test_an_amass_motion_is_posed_by_its_own_model_and_fitted(smplh_models, amas
     assert found.error_mm["mean"] < FIT_MM
     assert str(found).startswith(f"amass, {AMASS_FRAMES} frames at 60 fps, fitted with an error of mean ")
     motion = read_motion(tmp_path / "out/motion.npz")
-    body = {"backend": "smplh", "params": {"betas": [0.5, -1.0]}, "options": {"gender": "female"}}
+    body = {"backend": "smplh", "params": {"betas": [0.5, -1.0, 0.0]}, "options": {"gender": "female"}}
     assert motion.identity == body
     assert (motion.fps, motion.frame_count) == (60, AMASS_FRAMES)
     assert motion.licence.startswith("that of walk_poses.npz; body model: non-commercial")
