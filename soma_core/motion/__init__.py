@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from soma_core.motion.identities import stored_identity
     from soma_core.motion.options import ConvertOptions, FitOptions, InvertOptions
     from soma_core.motion.played import Played
-    from soma_core.motion.writers import WriteOptions, write_products
+    from soma_core.motion.writers import WriteOptions, write_body, write_products
     from soma_core.options import BackendChoice, FrameRange, IdentityChoice, InversionChoice, Picture
 
 __all__ = [
@@ -49,6 +49,7 @@ __all__ = [
     "read",
     "stored_identity",
     "write",
+    "write_body",
     "write_products",
 ]
 
@@ -61,7 +62,7 @@ _HOMES = {
     "soma_core.motion.identities": ["stored_identity"],
     "soma_core.motion.options": ["ConvertOptions", "FitOptions", "InvertOptions"],
     "soma_core.motion.played": ["Played"],
-    "soma_core.motion.writers": ["WriteOptions", "write_products"],
+    "soma_core.motion.writers": ["WriteOptions", "write_body", "write_products"],
     "soma_core.options": ["BackendChoice", "FrameRange", "IdentityChoice", "InversionChoice", "Picture"],
 }
 

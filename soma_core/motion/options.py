@@ -162,5 +162,8 @@ class ConvertOptions(WriteOptions, FitOptions):
         for name in ("joints", "camera", "write_up"):
             if getattr(self, name) is not None:
                 raise InputError(
-                    name, got=str(getattr(self, name)), expected=f"none with to={self.to}", fix=f"Leave {name} out."
+                    name,
+                    got=str(getattr(self, name)),
+                    expected=f"none with to={self.to}",
+                    fix=f"Leave {name} out.",
                 )

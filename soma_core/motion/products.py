@@ -32,7 +32,13 @@ class BodyProducts:
         self._chosen = MovingBodies(options, options.backend, translation)
 
     def __call__(
-        self, path: Path, files: ResultFiles, report: dict[str, Any], before: Mapping[str, Any], *, fitted: bool
+        self,
+        path: Path,
+        files: ResultFiles,
+        report: dict[str, Any],
+        before: Mapping[str, Any],
+        *,
+        fitted: bool,
     ) -> dict[str, Path]:
         """Write what is not there yet, and say in the report how.
 
@@ -65,9 +71,7 @@ class BodyProducts:
         missing = [product for product, place in places.items() if not (same and place.exists())]
         if missing:
             played = bodies.played(layer, stored, motion)
-            write_products(
-                played, missing, places.__getitem__, options=options, picture=options.picture
-            )
+            write_products(played, missing, places.__getitem__, options=options, picture=options.picture)
         report["products"] = {
             "settings": settings,
             "files": {product: str(place.relative_to(files.folder)) for product, place in places.items()},

@@ -16,10 +16,20 @@ from soma_core.errors import InputError
 from soma_core.options import Options, Picture, Product, Upward
 
 if TYPE_CHECKING:
+    from soma_core.layer import SomaLayer
+    from soma_core.skeleton.identity import Identity
     from soma_core.io.motion import Motion
     from soma_core.motion.played import Played
 
-__all__ = ["MESH_WRITERS", "WRITERS", "WriteOptions", "Writer", "listed_writers", "write_products"]
+__all__ = [
+    "MESH_WRITERS",
+    "WRITERS",
+    "WriteOptions",
+    "Writer",
+    "listed_writers",
+    "write_body",
+    "write_products",
+]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -189,6 +199,25 @@ def write_products(
     return written
 
 
+def write_body(path: str | Path, layer: SomaLayer, identity: Identity, motion: Motion) -> None:
+    """Write a body that moves as one file with mesh, skeleton, skin, correctives and animation, atomically.
+
+    Args:
+        path: ``.glb`` (glTF), ``.usdc``, ``.usda`` or ``.usd`` (UsdSkel).
+        layer: the forward path.
+        identity: one identity.
+        motion: how it moves; metres, +Y up, taken as it stands.
+
+    Raises:
+        InputError: another suffix, or an identity that is a batch.
+    """
+    from soma_core.motion.played import Played
+
+    product = Product.glb if Path(path).suffix == ".glb" else Product.usd
+    played = Played(layer=layer, identity=identity, motion=motion)
+    WRITERS[product].write(Path(path), *_NEEDED["body"](played))
+
+
 def _view(played: Played, turned: Played, options: WriteOptions, picture: Picture) -> tuple[Any, ...]:  # noqa: ARG001
     """Joints and the camera that sees them; its world is +Y up."""
     from soma_core.io.camera import read_camera
@@ -223,11 +252,13 @@ def draw_contact_sheet(path: Path, played: Played, picture: Picture) -> None:
 
     count, total = picture.frames, played.motion.frame_count
     layer, bodies = played.layer, []
-    for frame in np.unique((np.arange(count) + 0.5) * total / count).astype(int).tolist():
+    for frame in np.unique(((np.arange(count) + 0.5) * total / count).astype(int)).tolist():
         vertices = played.posed(slice(frame, frame + 1))[0].cpu().numpy()
         bodies.append(
             Body(
-                vertices=vertices, triangles=layer.mesh.triangles, colour=backend_colour(layer.backend),
+                vertices=vertices,
+                triangles=layer.mesh.triangles,
+                colour=backend_colour(layer.backend),
                 caption=f"{frame / played.motion.fps:.2f} s",
             )  # fmt: skip
         )

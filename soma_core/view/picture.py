@@ -32,6 +32,8 @@ _COLOURS = {
 _INK = (70, 70, 72)
 _GALLERY_AZIMUTH = 8.0
 """Less than in a contact sheet: there the pose that identities share hides one leg behind the other."""
+_FEWEST = 3
+"""A cell is no wider than a sheet's width by this."""
 _MARGIN, _SIDE = 1.13, 1.17
 """Height and width of a view in units of the body in it: more than what fades at the edges of a cell."""
 
@@ -49,10 +51,12 @@ def contact_sheet(
 ) -> None:
     """Write frames of one motion as a grid of cells, all at one scale, the camera following the body.
 
+    The floor lies under the lowest of all frames, so that a jump is seen.
+
     Args:
         path: the PNG.
         bodies: one a frame.
-        width: width of the picture in pixels.
+        width: width of a whole row in pixels; fewer than three frames make a narrower picture.
         columns: cells in a row.
         legend: a picture of the same width to put below.
 
@@ -66,12 +70,13 @@ def contact_sheet(
     feet[:, 1] = floor
     reach = max(float((boxes[:, 1, axis] - boxes[:, 0, axis]).max()) for axis in (0, 2)) * 1.1
     tall = (boxes[:, 1, 1].max() - floor) * 1.12
-    cell = (width // columns, int(width / columns * max(tall / reach, 0.9)))
+    wide = width // max(columns, _FEWEST)
+    cell = (wide, int(wide * max(tall / reach, 0.9)))
     rise, height = _framing(bodies, feet, cell[0] / cell[1])
     cells = []
     with open_stage(cell) as stage:
         for body, place in zip(bodies, feet + np.array([0, rise, 0]), strict=True):
-            cells.append(_faded(stage.shot([body], focus=place, height=height)))
+            cells.append(_faded(stage.shot([body], focus=place, height=height, floor=floor)))
     sheet = _grid(cells, bodies, columns)
     sheet = _stacked([sheet, legend]) if legend is not None else sheet
     atomic_write(path, lambda target: sheet.save(target, "PNG"))

@@ -113,13 +113,22 @@ class Stage:
         self._plotter.close()
 
     def shot(
-        self, bodies: Sequence[Body], *, focus: Sequence[float], height: float, flat: bool = False
+        self,
+        bodies: Sequence[Body],
+        *,
+        focus: Sequence[float],
+        height: float,
+        flat: bool = False,
+        floor: float | None = None,
     ) -> Image:
-        """Draw `bodies` with `height` metres of the plane through `focus` filling the picture."""
+        """Draw `bodies` with `height` metres of the plane through `focus` filling the picture.
+
+        The floor lies at y = `floor`, or under the lowest of them.
+        """
         from PIL import Image
 
         actors = [self._add_body(body) for body in bodies]
-        actors.append(self._add_floor(bodies))
+        actors.append(self._add_floor(bodies, floor))
         self._aim(np.asarray(focus, float), height, azimuth=0.0 if flat else AZIMUTH)
         with quiet_display():
             self._plotter.render()
@@ -138,9 +147,9 @@ class Stage:
             paint = {"scalars": np.round(255 * body.shades).astype(np.uint8), "rgb": True}
         return self._plotter.add_mesh(mesh, smooth_shading=True, render=False, **paint, **_SKIN)
 
-    def _add_floor(self, bodies: Sequence[Body]) -> Any:
+    def _add_floor(self, bodies: Sequence[Body], floor: float | None) -> Any:
         """A floor of the colour of the background that shows nothing but the soft shadow of the bodies."""
-        shadow, low, high, level = _shadow(bodies)
+        shadow, low, high, level = _shadow(bodies, floor)
         points = np.array([[x, level - 0.002, z] for z in (low[1], high[1]) for x in (low[0], high[0])])
         plane = self._pv.PolyData(points, [4, 0, 1, 3, 2])
         plane.active_texture_coordinates = np.array([[0, 0], [1, 0], [0, 1], [1, 1]], np.float32)
@@ -170,11 +179,13 @@ def camera_axes(azimuth: float) -> np.ndarray:
     )
 
 
-def _shadow(bodies: Sequence[Body], pixel: float = 0.01) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
+def _shadow(
+    bodies: Sequence[Body], floor: float | None, pixel: float = 0.01
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
     """Shadow on the floor in 0..1 (rows z, columns x), its corners (x, z) and the height of the floor."""
     points = np.concatenate([body.vertices for body in bodies])
-    level = float(points[:, 1].min())
-    above = points[:, 1] - level
+    level = float(points[:, 1].min()) if floor is None else floor
+    above = np.maximum(points[:, 1] - level, 0)
     cast = points[:, [0, 2]] + above[:, None] * _SUN
     low = np.minimum(cast.min(axis=0), points[:, [0, 2]].min(axis=0)) - 0.8
     high = np.maximum(cast.max(axis=0), points[:, [0, 2]].max(axis=0)) + 0.8
