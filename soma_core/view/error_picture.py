@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from soma_core.view.picture import contact_sheet
+from soma_core.view.picture import contact_sheet, sheet_width
 from soma_core.view.stage import PAPER, Body
 
 if TYPE_CHECKING:
@@ -57,9 +57,8 @@ def error_sheet(
         for body, errors in zip(bodies, errors_mm, strict=True)
     ]
     columns = min(len(shaded), 5)
-    contact_sheet(
-        path, shaded, width=width, columns=columns, legend=colour_bar(width // columns * columns, top)
-    )
+    wide = sheet_width(len(shaded), width) // columns * columns
+    contact_sheet(path, shaded, width=width, columns=columns, legend=colour_bar(wide, top))
 
 
 def scale_top(errors_mm: np.ndarray) -> float:

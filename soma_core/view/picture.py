@@ -18,7 +18,7 @@ from soma_core.view.stage import AZIMUTH, PAPER, VIEW_ANGLE, Body, camera_axes, 
 if TYPE_CHECKING:
     from PIL.Image import Image
 
-__all__ = ["backend_colour", "contact_sheet", "gallery"]
+__all__ = ["backend_colour", "contact_sheet", "gallery", "sheet_width"]
 
 # The paper's figures: SOMA green, MHR blue, SMPL pink, Anny yellow.
 _COLOURS = {
@@ -32,8 +32,6 @@ _COLOURS = {
 _INK = (70, 70, 72)
 _GALLERY_AZIMUTH = 8.0
 """Less than in a contact sheet: there the pose that identities share hides one leg behind the other."""
-_FEWEST = 3
-"""A cell is no wider than a sheet's width by this."""
 _MARGIN, _SIDE = 1.13, 1.17
 """Height and width of a view in units of the body in it: more than what fades at the edges of a cell."""
 
@@ -46,6 +44,11 @@ def backend_colour(name: str) -> tuple[float, float, float]:
     return colorsys.hls_to_rgb(hue, 0.68, 0.42)
 
 
+def sheet_width(count: int, width: int) -> int:
+    """Width of a contact sheet of `count` frames: a single one would stand three times as tall as a row."""
+    return width if count > 1 else width // 3
+
+
 def contact_sheet(
     path: Path, bodies: Sequence[Body], *, width: int = 1600, columns: int = 5, legend: Image | None = None
 ) -> None:
@@ -56,7 +59,7 @@ def contact_sheet(
     Args:
         path: the PNG.
         bodies: one a frame.
-        width: width of a whole row in pixels; fewer than three frames make a narrower picture.
+        width: width of the picture in pixels; a single frame takes a third of it.
         columns: cells in a row.
         legend: a picture of the same width to put below.
 
@@ -70,7 +73,7 @@ def contact_sheet(
     feet[:, 1] = floor
     reach = max(float((boxes[:, 1, axis] - boxes[:, 0, axis]).max()) for axis in (0, 2)) * 1.1
     tall = (boxes[:, 1, 1].max() - floor) * 1.12
-    wide = width // max(columns, _FEWEST)
+    wide = sheet_width(len(bodies), width) // columns
     cell = (wide, int(wide * max(tall / reach, 0.9)))
     rise, height = _framing(bodies, feet, cell[0] / cell[1])
     cells = []

@@ -117,3 +117,21 @@ def test_gallery_turns_every_body_alike_towards_the_camera():
         )
         seen.append(np.arctan2(front[2], front[0]) - np.arctan2(towards[1], towards[0]))
     np.testing.assert_allclose(seen, seen[0], atol=1e-9)
+
+
+def test_one_floor_lies_under_all_frames(pyvista, tmp_path):
+    """A body in the air is drawn in the air."""
+    red = (0.9, 0.2, 0.2)
+    low = box(0.4, 1.0, red)
+    high = replace(low, vertices=low.vertices + np.array([0, 0.8, 0]))
+    contact_sheet(tmp_path / "sheet.png", [low, high], width=400, columns=2)
+    mask = painted(tmp_path / "sheet.png", red)
+    feet = [np.flatnonzero(mask[:, part].any(axis=1)).max() for part in (slice(200), slice(200, 400))]
+    heights = np.ptp(np.flatnonzero(mask[:, :200].any(axis=1)))
+    assert feet[0] - feet[1] > 0.5 * heights
+
+
+def test_a_single_frame_is_a_third_as_wide(pyvista, tmp_path):
+    contact_sheet(tmp_path / "sheet.png", [box(0.5, 1.5, (0.2, 0.8, 0.2))], width=600)
+    with PIL.open(tmp_path / "sheet.png") as picture:
+        assert picture.width == 200
