@@ -123,6 +123,7 @@ class Product(StrEnum):
     npz = "npz"
     usd = "usd"
     glb = "glb"
+    html = "html"
     png = "png"
     joints = "joints"
     csv = "csv"

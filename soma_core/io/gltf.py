@@ -15,7 +15,7 @@ from soma_core.io.clip import SkinnedClip, linear_colour
 from soma_core.io.glb import GlbBuffer, glb_bytes
 from soma_core.rig.mesh import CanonicalMesh
 
-__all__ = ["write_gltf"]
+__all__ = ["gltf_bytes", "write_gltf"]
 
 _SET_WIDTH = 4
 """Influences in one JOINTS_n attribute, fixed by glTF."""
@@ -42,13 +42,18 @@ def write_gltf(path: str | Path, clip: SkinnedClip) -> None:
     path = Path(path)
     if path.suffix != ".glb":
         raise InputError("path", got=repr(path.name), expected="a .glb file", fix="Change the suffix.")
-    buffer = GlbBuffer()
-    content = glb_bytes(_document(clip, buffer), buffer)
+    content = gltf_bytes(clip)
 
     def write(temporary: Path) -> None:
         temporary.write_bytes(content)
 
     atomic_write(path, write)
+
+
+def gltf_bytes(clip: SkinnedClip) -> bytes:
+    """The GLB that :func:`write_gltf` writes."""
+    buffer = GlbBuffer()
+    return glb_bytes(_document(clip, buffer), buffer)
 
 
 def _document(clip: SkinnedClip, buffer: GlbBuffer) -> dict[str, Any]:

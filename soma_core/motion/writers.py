@@ -108,6 +108,10 @@ WRITERS: dict[Product, Writer] = {
     Product.glb: Writer(
         file="body.glb", needs="body", function=f"{_IO}.gltf:write_gltf", summary="glTF: the same",
     ),
+    Product.html: Writer(
+        file="body.html", needs="body", function="soma_core.view.page:write_page",
+        summary="a page that plays the body in a browser, with no server and no network",
+    ),
     Product.png: Writer(
         file="contact_sheet.png", needs="pictures", function=f"{__name__}:draw_contact_sheet",
         summary="frames of the clip",
@@ -203,7 +207,7 @@ def write_body(path: str | Path, layer: SomaLayer, identity: Identity, motion: M
     """Write a body that moves as one file with mesh, skeleton, skin, correctives and animation, atomically.
 
     Args:
-        path: ``.glb`` (glTF), ``.usdc``, ``.usda`` or ``.usd`` (UsdSkel).
+        path: ``.glb`` (glTF), ``.usdc``, ``.usda`` or ``.usd`` (UsdSkel), ``.html`` (a page that plays it).
         layer: the forward path.
         identity: one identity.
         motion: how it moves; metres, +Y up, taken as it stands.
@@ -213,7 +217,7 @@ def write_body(path: str | Path, layer: SomaLayer, identity: Identity, motion: M
     """
     from soma_core.motion.played import Played
 
-    product = Product.glb if Path(path).suffix == ".glb" else Product.usd
+    product = {".glb": Product.glb, ".html": Product.html}.get(Path(path).suffix, Product.usd)
     played = Played(layer=layer, identity=identity, motion=motion)
     WRITERS[product].write(Path(path), *_NEEDED["body"](played))
 
@@ -265,13 +269,22 @@ def draw_contact_sheet(path: Path, played: Played, picture: Picture) -> None:
     contact_sheet(path, bodies, width=picture.width)
 
 
+def _rounded(value: Any) -> Any:
+    """Numbers to six digits, which is what float32 holds of them."""
+    if isinstance(value, Mapping):
+        return {name: _rounded(one) for name, one in value.items()}
+    if isinstance(value, list | tuple):
+        return [_rounded(one) for one in value]
+    return value if isinstance(value, str) else float(f"{float(value):.6g}")
+
+
 def _metadata(played: Played) -> dict[str, str]:
     """Texts that travel with the exported body."""
     layer, motion = played.layer, played.motion
     return {
         "backend": layer.backend,
         "licence": layer.spec.licence,
-        "identity": json.dumps(motion.identity.get("params", {}), sort_keys=True, default=float),
+        "identity": json.dumps(_rounded(motion.identity.get("params", {})), sort_keys=True),
         "rig_revision": layer.rig.revision,
         "motion": motion.source,
         "motion_licence": motion.licence,
