@@ -81,7 +81,7 @@ PUBLIC_NAMES = {
     """,
     "soma_core.plugin": """
         API_VERSION Axis BackendSpec BrokenBackendError Check CheckFailedError ClosestFaces FileNeeded
-        Generator HasLinearBasis HasPosed HasRandomPoses HasSkinning HasTriangles Level LinearBasis
+        Generator HasLinearBasis HasPoseVector HasPosed HasRandomPoses HasSkinning HasTriangles Level LinearBasis
         Parameter PluginError Registry SkinnedModel Unit WrapPair atomic_arrays atomic_write
         axis_angle_to_matrix
         cached_arrays check closest_point_on_triangle content_key data_dir file_sha256 hookimpl
