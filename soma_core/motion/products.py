@@ -56,7 +56,7 @@ class BodyProducts:
         settings = {
             "content": fingerprint(path), **model_settings(layer), "backend": layer.backend,
             "params": stored.get("params"), "options": layer.options, "translation": str(options.translation),
-            "joints": options.joints, "camera": camera, "write_up": options.write_up,
+            "joints": options.joints, "camera": camera, "write_up": options.write_up, "bvh": asdict(options.bvh),
             "picture": asdict(options.picture),
         }  # fmt: skip
         settings = json.loads(json.dumps(settings, default=str))

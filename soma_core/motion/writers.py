@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from soma_core.errors import InputError
-from soma_core.options import Options, Picture, Product, Upward
+from soma_core.options import BvhChoice, Options, Picture, Product, Upward
 
 if TYPE_CHECKING:
     from soma_core.io.motion import Motion
@@ -28,7 +28,7 @@ class Writer:
 
     Attributes:
         file: what it is called in a folder of its own; without a suffix it is a folder of files.
-        needs: of the motion: itself, its joints, those before a camera, vertices, mesh and skeleton, or
+        needs: of the motion: itself, its rotations on the body's bones, its joints, those before a camera, vertices, mesh and skeleton, or
             pictures.
         function: ``module:name`` of what writes it; takes the path, and what is needed.
         summary: for people.
@@ -36,7 +36,7 @@ class Writer:
     """
 
     file: str
-    needs: Literal["motion", "joints", "view", "vertices", "body", "pictures"]
+    needs: Literal["motion", "rotations", "joints", "view", "vertices", "body", "pictures"]
     function: str
     summary: str
     settings: tuple[str, ...] = field(default=())
@@ -53,6 +53,10 @@ WRITERS: dict[Product, Writer] = {
     Product.npz: Writer(
         file="motion.npz", needs="motion", function=f"{__name__}:write_motion_npz",
         summary="the motion in this project's schema, which the SOMA tools read",
+    ),
+    Product.bvh: Writer(
+        file="motion.bvh", needs="rotations", function=f"{__name__}:write_bvh_file",
+        summary="the skeleton of the body and its Euler angles", settings=("bvh",),
     ),
     Product.joints: Writer(
         file="joints.npz", needs="joints", function=f"{_IO}.joint_files:write_joints_npz",
@@ -125,11 +129,25 @@ class WriteOptions(Options):
         joints: names of the joints that are written, in this order; None: all.
         camera: JSON file of the camera that sees keypoints; see ``soma_core.io.camera``.
         write_up: upward axis of the world of joints and vertices; None: y.
+        bvh: of that format.
     """
 
     joints: list[str] | None = None
     camera: str | None = None
     write_up: Upward | None = None
+    bvh: BvhChoice = field(default_factory=BvhChoice)
+
+    def given(self) -> dict[str, str]:
+        """The settings that are not as usual, as text."""
+        usual, found = WriteOptions.__dataclass_fields__, {}
+        for name in usual:
+            value = getattr(self, name)
+            if isinstance(value, BvhChoice):
+                changed = {key: str(each) for key, each in vars(value).items() if each != vars(BvhChoice())[key]}
+                value = ", ".join(f"{key}={each}" for key, each in changed.items()) or None
+            if value is not None:
+                found[name] = str(value)
+        return found
 
     def refuse_unused(self, products: Iterable[Product]) -> None:
         """Refuse settings that nothing among `products` takes, and products whose settings are missing.
@@ -138,12 +156,12 @@ class WriteOptions(Options):
             InputError: the first one, with the products that would take it.
         """
         products = list(products)
-        for name in ("joints", "camera", "write_up"):
-            value, takers = getattr(self, name), [key for key, row in WRITERS.items() if name in row.settings]
-            if value is None or set(takers) & set(products):
+        for name, value in self.given().items():
+            takers = [key for key, row in WRITERS.items() if name in row.settings]
+            if set(takers) & set(products):
                 continue
             raise InputError(
-                name, got=str(value), expected=f"none with write=[{','.join(products)}]",
+                name, got=value, expected=f"none with write=[{','.join(products)}]",
                 fix=f"Leave {name} out, or write one of {', '.join(takers)}.",
             )  # fmt: skip
         if Product.keypoints in products and self.camera is None:
@@ -198,6 +216,7 @@ def _view(played: Played, turned: Played, options: WriteOptions, picture: Pictur
 
 _NEEDED: Mapping[str, Callable[..., tuple[Any, ...]]] = {
     "motion": lambda played, *_: (played.motion,),
+    "rotations": lambda played, _, options, __: (played, options.bvh),
     "joints": lambda _, turned, options, picture: (turned.joints(options.joints),),  # noqa: ARG005
     "view": _view,
     "vertices": lambda _, turned, *__: (turned.meshes(),),
@@ -212,6 +231,17 @@ def write_motion_npz(path: Path, motion: Motion) -> None:
     from soma_core.motion.files import write
 
     write(motion, path)
+
+
+def write_bvh_file(path: Path, played: Played, choice: BvhChoice) -> None:
+    """Write the motion on the body's own bones as BVH."""
+    from soma_core.io.bvh import write_bvh
+
+    bind = played.identity.bind_world[0].detach().cpu().double().numpy()
+    write_bvh(
+        played.motion, path, rig=played.layer.rig, bind_world=bind, joints=choice.joints,
+        order=str(choice.order), rest=str(choice.rest), unit=str(choice.unit),
+    )  # fmt: skip
 
 
 def draw_contact_sheet(path: Path, played: Played, picture: Picture) -> None:
