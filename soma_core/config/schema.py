@@ -63,9 +63,7 @@ class AnimateConfig(ModelOptions, WriteOptions, _PlayedMotion):
     """Configuration of ``soma animate``."""
 
     seed: int = 0
-    write: list[Product] = field(
-        default_factory=lambda: [Product.npz, Product.usd, Product.glb, Product.png]
-    )
+    write: list[Product] = field(default_factory=lambda: [Product.npz, Product.usd, Product.glb, Product.png])
     picture: Picture = field(default_factory=Picture)
 
 

@@ -17,7 +17,14 @@ from soma_core.io.camera import Camera
 from soma_core.io.joint_order import PARENT_NAMES
 from soma_core.io.npz_parts import write_npz_parts
 
-__all__ = ["JointFrames", "JointPiece", "chosen_joints", "write_joints_csv", "write_joints_npz", "write_keypoints"]
+__all__ = [
+    "JointFrames",
+    "JointPiece",
+    "chosen_joints",
+    "write_joints_csv",
+    "write_joints_npz",
+    "write_keypoints",
+]
 
 _COLUMNS = ("x_m", "y_m", "z_m", "qw", "qx", "qy", "qz")
 
@@ -71,9 +78,14 @@ def chosen_joints(wanted: Sequence[str] | None, known: Sequence[str]) -> list[in
         return list(range(len(known)))
     strange = [name for name in wanted if name not in known or list(wanted).count(name) > 1]
     if strange or not wanted:
-        got = (f"{strange[0]!r} twice" if strange[0] in known else repr(strange[0])) if strange else "no joint"
+        got = (
+            (f"{strange[0]!r} twice" if strange[0] in known else repr(strange[0])) if strange else "no joint"
+        )
         raise InputError(
-            "joints", got=got, expected=f"names among {', '.join(known)}", fix="Correct the name, or leave it out."
+            "joints",
+            got=got,
+            expected=f"names among {', '.join(known)}",
+            fix="Correct the name, or leave it out.",
         )
     return [known.index(name) for name in wanted]
 

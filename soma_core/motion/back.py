@@ -30,6 +30,7 @@ __all__ = ["BackConverter"]
 
 _log = logging.getLogger(__name__)
 
+
 class BackConverter:
     """Converts one motion after another to a backend's model; layers and fits serve all of them.
 
@@ -101,7 +102,6 @@ class BackConverter:
             up=f"+{chosen.up or 'z'}", params=params, width=chosen.num_betas,
             layout=str(chosen.layout or SmplLayout.amass),
         )  # fmt: skip
-
 
     def _parameter_target(self, own: Mapping[str, Any], kind: Mapping[str, Any]) -> NativeTarget:
         """What becomes of the body in a model whose pose is one vector."""

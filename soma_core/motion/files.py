@@ -67,7 +67,6 @@ class ResultFiles:
             picture=report.with_suffix(".png"),
         )
 
-
     def product(self, product: Product) -> Path:
         """Where a product goes."""
         file = Path(WRITERS[product].file)

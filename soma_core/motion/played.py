@@ -172,7 +172,9 @@ class MovingBodies:
     def played(self, layer: SomaLayer, stored: Mapping[str, Any], motion: Motion) -> Played:
         """The motion on that body, where it is to stand."""
         if not check_rig(motion, layer.rig.revision):
-            _log.info("the motion was made for rig %s; its relative rotations carry over", motion.rig_revision)
+            _log.info(
+                "the motion was made for rig %s; its relative rotations carry over", motion.rig_revision
+            )
         with torch.no_grad():
             identity = stored_identity(layer, stored)
             if self._translation != "motion":

@@ -1,8 +1,8 @@
 """SOMA bodies to the parameters of a native model that says nothing but where its vertices go.
 
-A model that tells its skinning is fitted by :class:`NativeFit`, exactly and many frames at once. Others, such as
-MHR, whose pose is one vector of parameters, are evaluated: Levenberg-Marquardt steps on vertices, their slopes by
-differences.
+A model that tells its skinning is fitted by :class:`NativeFit`, exactly and many frames at once. Others, such
+as MHR, whose pose is one vector of parameters, are evaluated: Levenberg-Marquardt steps on vertices, their
+slopes by differences.
 """
 
 from __future__ import annotations
@@ -132,7 +132,11 @@ class ParameterFit:
         rest = torch.zeros(self.generator.pose_size, device=self.device, dtype=self.dtype)
         found, last = [], None
         for frame, usable in zip(target[:, self._points], valid.tolist(), strict=True):
-            row = _Fitted(rest, torch.inf, converged=False, steps=0) if not usable else self._frame(body, frame, last)
+            row = (
+                _Fitted(rest, torch.inf, converged=False, steps=0)
+                if not usable
+                else self._frame(body, frame, last)
+            )
             last = row if usable else last
             found.append(row)
         parameters = torch.stack([row.point for row in found])
@@ -140,7 +144,8 @@ class ParameterFit:
         error = torch.linalg.vector_norm(shown - target, dim=-1)
         known = valid[:, None] & self.transfer.covered
         return ParameterMotion(
-            parameters=parameters, params=body, vertex_error=error.masked_fill(~known, torch.nan), valid=valid,
+            parameters=parameters, params=body, valid=valid,
+            vertex_error=error.masked_fill(~known, torch.nan),
             converged=torch.tensor([row.converged for row in found]),
             iterations=torch.tensor([row.steps for row in found]),
         )  # fmt: skip
@@ -177,7 +182,10 @@ class ParameterFit:
         pose_steps = self._pose_steps()
         ranges = {each.name: each.range[1] - each.range[0] for each in self.spec.params}
         steps = torch.cat(
-            [pose_steps, *(pose_steps.new_full((size,), _SHARE * ranges[name]) for name, size in sizes.items())]
+            [
+                pose_steps,
+                *(pose_steps.new_full((size,), _SHARE * ranges[name]) for name, size in sizes.items()),
+            ]
         )
         fitted = self._levenberg(inputs, start, target, steps, around=start)
         return inputs(fitted.point[None])[0]
@@ -220,7 +228,7 @@ class ParameterFit:
         around: Tensor,
         free: Tensor | None = None,
     ) -> _Fitted:
-        """Least squares from `start`: vertices to `target`, and parameters to `around` where nothing tells."""
+        """Least squares from `start`: points to `target`, and parameters to `around` where nothing tells."""
         free = torch.arange(len(start), device=self.device) if free is None else free
         point, damping, accepted, converged = start, 1e-3, 0, False
         shown = self._seen(inputs, point[None])[0]
@@ -250,7 +258,13 @@ class ParameterFit:
                 converged = True
                 break
             change = float((trial_shown - shown).square().sum(-1).mean().sqrt())
-            point, shown, error, accepted, damping = trial, trial_shown, trial_error, accepted + 1, damping / _CALM
+            point, shown, error, accepted, damping = (
+                trial,
+                trial_shown,
+                trial_error,
+                accepted + 1,
+                damping / _CALM,
+            )
             if change < self._tolerance:
                 converged = True
                 break

@@ -68,7 +68,13 @@ def test_a_csv_of_joints(tmp_path):
         np.testing.assert_array_equal(np.array(turns, np.float32), file["quaternions"])
 
 
-CAMERA = {"fx": 800, "fy": 900, "cx": 320, "cy": 240, "extrinsics": [[1, 0, 0, 0.1], [0, -1, 0, 1], [0, 0, -1, 2]]}
+CAMERA = {
+    "fx": 800,
+    "fy": 900,
+    "cx": 320,
+    "cy": 240,
+    "extrinsics": [[1, 0, 0, 0.1], [0, -1, 0, 1], [0, 0, -1, 2]],
+}
 
 
 def written(folder, **changes):
@@ -106,7 +112,9 @@ def test_a_camera_may_move(tmp_path):
             still = read_camera(written(tmp_path, extrinsics=moving[frame].tolist()))
             alone = still.project(PLACES[frame : frame + 1])[0][0]
             np.testing.assert_array_equal(file["keypoints"][frame], alone)
-    with pytest.raises(InputError, match=r"extrinsics: got 7 matrices, expected one, or one for each of the 1 "):
+    with pytest.raises(
+        InputError, match=r"extrinsics: got 7 matrices, expected one, or one for each of the 1 "
+    ):
         write_keypoints(tmp_path / "k.npz", joints(frame_count=1), camera)
 
 

@@ -8,14 +8,21 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-
 from scipy.spatial.transform import Rotation
 
 from soma_core import SomaLayer
 from soma_core.cli import EXIT_OK, EXIT_USAGE, main
 from soma_core.errors import InputError
 from soma_core.io import open_vertex_sequence, write_motion
-from soma_core.motion import BackendChoice, ConvertOptions, convert_file, convert_folder, load_clip, played, write_products
+from soma_core.motion import (
+    BackendChoice,
+    ConvertOptions,
+    convert_file,
+    convert_folder,
+    load_clip,
+    played,
+    write_products,
+)
 from soma_core.motion.writers import MESH_WRITERS, WRITERS, listed_writers
 from soma_core.options import BvhChoice, FrameRange, Product
 
@@ -23,7 +30,13 @@ ROUNDING = 1e-6
 """Metres: float32 at the size of a body."""
 
 BODY = {"backend": "soma", "params": {"shape": [1.0, -0.5]}}
-CAMERA = {"fx": 800, "fy": 800, "cx": 320, "cy": 240, "extrinsics": [[1, 0, 0, 0], [0, -1, 0, 1], [0, 0, -1, 4]]}
+CAMERA = {
+    "fx": 800,
+    "fy": 800,
+    "cx": 320,
+    "cy": 240,
+    "extrinsics": [[1, 0, 0, 0], [0, -1, 0, 1], [0, 0, -1, 4]],
+}
 
 
 @pytest.fixture(scope="module")
@@ -66,7 +79,9 @@ def test_joints_are_those_of_the_layer_and_no_mesh_is_posed(file, posed, tmp_pat
         np.testing.assert_allclose(joints["positions"], posed.joints[:, places], atol=ROUNDING)
         x, y, z = (joints["quaternions"][..., axis] for axis in (1, 2, 3))
         w = joints["quaternions"][..., 0]
-        turned = np.stack([1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)], -1)  # the x axis
+        turned = np.stack(
+            [1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)], -1
+        )  # the x axis
         np.testing.assert_allclose(turned, posed.transforms[:, 1:][:, places, :3, 0], atol=ROUNDING)
     assert found.written == {"npz": tmp_path / "out/motion.npz", "joints": tmp_path / "out/joints.npz"}
 
@@ -103,7 +118,9 @@ def test_products_are_written_once(file, tmp_path, monkeypatch):
     made = []
     monkeypatch.setattr(
         "soma_core.motion.products.write_products",
-        lambda played, products, *rest, **more: made.append(products) or write_products(played, products, *rest, **more),
+        lambda played, products, *rest, **more: (
+            made.append(products) or write_products(played, products, *rest, **more)
+        ),
     )
     for write, settings in (
         (["joints"], {}), (["joints", "csv"], {}), (["joints", "csv"], {}), (["csv"], {"joints": ["Hips"]}),
@@ -144,11 +161,17 @@ def test_the_command_says_what_was_written_where(file, tmp_path, monkeypatch, ca
 @pytest.mark.parametrize(
     ("changes", "said"),
     [
-        ({"joints": ["Hips"]}, r"joints: got \['Hips'\], expected none with write=\[npz\].*or write one of joints, csv"),
+        (
+            {"joints": ["Hips"]},
+            r"joints: got \['Hips'\], expected none with write=\[npz\].*or write one of joints, csv",
+        ),
         ({"write": ["obj"], "camera": "c"}, r"camera: got c, expected none with write=\[obj\]"),
         ({"write": ["glb"], "write_up": "z"}, r"write_up: got z, expected none with write=\[glb\]"),
         ({"write": ["keypoints"]}, r"camera: got none, expected the camera.*camera=FILE\.json"),
-        ({"write": ["obj"], "bvh": BvhChoice(order="XYZ")}, r"bvh: got order=XYZ, expected none with write=.obj."),
+        (
+            {"write": ["obj"], "bvh": BvhChoice(order="XYZ")},
+            r"bvh: got order=XYZ, expected none with write=.obj.",
+        ),
         ({"write": ["abc"]}, "write: got 'abc', expected one of npz, usd, glb"),
         ({"write": [1]}, "write: got 1, expected one of npz"),
     ],
@@ -229,7 +252,9 @@ def joints_of_bvh(path):
             moved.add(joint)
             place[:, joint, axis] = column
         else:
-            turn[:, joint] = turn[:, joint] @ Rotation.from_euler("xyz"[axis], column[:, None], degrees=True).as_matrix()
+            turn[:, joint] = (
+                turn[:, joint] @ Rotation.from_euler("xyz"[axis], column[:, None], degrees=True).as_matrix()
+            )
     for joint, parent in enumerate(parents):
         if parent >= 0:
             place[:, joint] = place[:, parent] + np.einsum("fab,fb->fa", turn[:, parent], place[:, joint])

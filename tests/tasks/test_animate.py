@@ -205,7 +205,9 @@ def test_the_motion_of_a_body_keeps_that_body(layer, motion, tmp_path, measured)
     """In Python too, whatever body the motion was recorded with."""
     body = layer.identity({"shape": [1.0]})
     given = body if measured else layer.identity_from_rest(body.fitted_rest)
-    played = animate(layer, given, replace(motion, identity={"backend": "anny", "params": {"age": 0.1}})).motion
+    played = animate(
+        layer, given, replace(motion, identity={"backend": "anny", "params": {"age": 0.1}})
+    ).motion
     write(played, tmp_path / "m.npz")
     again = stored_identity(layer, read_motion(tmp_path / "m.npz").identity)
     torch.testing.assert_close(again.rest, given.rest, atol=GROUND_TOLERANCE, rtol=0)

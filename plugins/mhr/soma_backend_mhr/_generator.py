@@ -68,7 +68,7 @@ class MhrGenerator:
         return self._evaluate(shared, parameters.expand(count, -1), expression.expand(count, -1))
 
     def own_arrays(self, params: Mapping[str, Tensor], parameters: Tensor) -> dict[str, Tensor]:
-        """Poses (frames, 130) of one body as SAM 3D Body names them: 204 model parameters, shape, expression."""
+        """Poses (frames, 130) of one body as SAM 3D Body names them: 204 parameters, shape, expression."""
         count = len(parameters)
         shared = {name: value.expand(count, -1) for name, value in params.items()}
         return {

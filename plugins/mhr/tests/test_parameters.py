@@ -2,21 +2,26 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
 
-from soma_core import InputError, SomaLayer
-from soma_core.inversion import PoseInversion
-from soma_core.motion import BackendChoice, ConvertOptions, convert_file, write
-from soma_core.motion import load_clip
-from soma_core.native import ParameterFit
-from soma_core.options import FrameRange
+from soma_core import InputError, ParameterFit, PoseInversion, SomaLayer
+from soma_core.motion import (
+    BackendChoice,
+    ConvertOptions,
+    FrameRange,
+    convert_file,
+    load_clip,
+    write,
+)
 
 TRUST = {"trust": True}
 
 SAME_MM = 1.0
-"""Mean distance to vertices that the model itself can reach: 595 vertices that went over our mesh and back."""
+"""Mean distance to vertices that the model itself can reach: 595 vertices that went over ours and back."""
 
 OTHER_SKIN_MM = 10.0
 """Mean distance to poses of our skin: the stand-in has angles for 42 joints of 78, and none for the legs."""
@@ -27,7 +32,7 @@ NEAR_MM = 3.0
 
 @pytest.fixture(scope="module")
 def tools(supplied, tmp_path_factory):
-    """Layer and fit of LOD 6, whose parameters are those of LOD 1, and the data folder while they are in use."""
+    """Layer and fit of LOD 6, whose parameters are those of LOD 1, and the data folder meanwhile."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("SOMA_DATA_DIR", str(supplied))
         patch.setenv("SOMA_CACHE_DIR", str(tmp_path_factory.mktemp("cache")))
@@ -79,9 +84,9 @@ def test_a_motion_becomes_parameters_as_sam3d_names_them(tools, tmp_path):
     _, fit = tools
     clip = load_clip(frames=FrameRange(start=0, stop=240, step=120))
     known = {"identity": [0.5] + [0.0] * 44, "scales": [0.0] * 68, "bone_lengths": [0.0] * 6}
-    from dataclasses import replace
-
-    write(replace(clip, identity={"backend": "mhr_lod6", "params": known, "options": TRUST}), tmp_path / "m.npz")
+    write(
+        replace(clip, identity={"backend": "mhr_lod6", "params": known, "options": TRUST}), tmp_path / "m.npz"
+    )
     options = ConvertOptions(to="mhr_lod6", result="poses", lod="low")
     report = convert_file(tmp_path / "m.npz", tmp_path / "out", options=options).report
     with np.load(tmp_path / "out/motion.npz", allow_pickle=False) as file:
@@ -95,11 +100,15 @@ def test_a_motion_becomes_parameters_as_sam3d_names_them(tools, tmp_path):
     posed = fit.generator.posed(own, {"parameters": parameters[:, :130]})
     layer = SomaLayer("mhr_lod6", options=TRUST, lod="low")
     target = fit.transfer(
-        layer.pose(layer.identity(known), torch.as_tensor(clip.rotations), torch.as_tensor(clip.translation)).vertices
+        layer.pose(
+            layer.identity(known), torch.as_tensor(clip.rotations), torch.as_tensor(clip.translation)
+        ).vertices
     )
     error = 10 * float((posed - target).norm(dim=-1)[:, fit.transfer.covered].mean())
     assert error < OTHER_SKIN_MM
-    assert report["error_mm"]["all"]["mean"] == pytest.approx(error, rel=0.1)  # which leaves the face's inside out
+    assert report["error_mm"]["all"]["mean"] == pytest.approx(
+        error, rel=0.1
+    )  # which leaves the face's inside out
     assert report["settings"]["params"] == known
 
 
