@@ -151,7 +151,7 @@ class SmplTarget:
         params = "found" if self.params is None else dict(self.params)
         return {
             "to": self.model, "gender": self.gender, "params": params, "up": self.up,
-            "num_betas": self.width, "layout": self.layout,
+            "num_betas": self.width, "to_layout": self.layout,
         }  # fmt: skip
 
     def results(self, files: ResultFiles) -> dict[str, Path]:

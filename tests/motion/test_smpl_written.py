@@ -121,7 +121,7 @@ def test_a_body_model_takes_what_is_written(motion_file, tmp_path, monkeypatch, 
     with np.load(tmp_path / "frames.npz") as frames:
         told = 1e3 * frames["mean_error"].mean()
     assert abs(error - told) < SAME_SHARE * told
-    assert found.report["settings"]["layout"] == changes.get("layout", "amass")
+    assert found.report["settings"]["to_layout"] == changes.get("layout", "amass")
 
 
 def test_there_and_back_as_close_as_the_models_allow(motion_file, tmp_path):
