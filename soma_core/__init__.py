@@ -35,6 +35,7 @@ if TYPE_CHECKING:
     from soma_core.layer import SomaLayer
     from soma_core.native.fit import NativeFit
     from soma_core.native.motion import NativeMotion
+    from soma_core.native.parameters import ParameterFit
     from soma_core.native.transfer import NativeTransfer
     from soma_core.paths import assets_dir
     from soma_core.plugin.errors import BackendError
@@ -61,6 +62,7 @@ __all__ = [
     "NativeFit",
     "NativeMotion",
     "NativeTransfer",
+    "ParameterFit",
     "PoseInversion",
     "PosePriors",
     "Posed",
@@ -112,6 +114,7 @@ _HOMES = {
     # To the meshes and poses of other models
     "soma_core.native.fit": ["NativeFit"],
     "soma_core.native.motion": ["NativeMotion"],
+    "soma_core.native.parameters": ["ParameterFit"],
     "soma_core.native.transfer": ["NativeTransfer"],
     # Motions
     "soma_core.io.motion": ["Motion"],

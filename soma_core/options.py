@@ -19,7 +19,10 @@ __all__ = [
     "AutogradChoice",
     "BackendChoice",
     "BodyGender",
+    "BvhChoice",
+    "BvhRest",
     "ConvertResult",
+    "EulerOrder",
     "FitLod",
     "FrameRange",
     "Gallery",
@@ -125,6 +128,7 @@ class Product(StrEnum):
     glb = "glb"
     html = "html"
     png = "png"
+    bvh = "bvh"
     joints = "joints"
     csv = "csv"
     keypoints = "keypoints"
@@ -222,6 +226,42 @@ class BackendChoice(Options):
         for field_name in ("params", "options"):
             given = vars(self)[field_name].items()
             object.__setattr__(self, field_name, {name: value for name, value in given if value is not None})
+
+
+class BvhRest(StrEnum):
+    """The pose at which the angles of a BVH are zero."""
+
+    t_pose = "t_pose"
+    bind = "bind"
+
+
+class EulerOrder(StrEnum):
+    """Order of the rotation channels of a BVH; the first is applied last."""
+
+    XYZ = "XYZ"
+    XZY = "XZY"
+    YXZ = "YXZ"
+    YZX = "YZX"
+    ZXY = "ZXY"
+    ZYX = "ZYX"
+
+
+@dataclass(kw_only=True)
+class BvhChoice(Options):
+    """How a BVH is written: its Euler angles, the pose of zeros, lengths, and 77 joints or 78 with a Root."""
+
+    order: EulerOrder = EulerOrder.ZXY
+    rest: BvhRest = BvhRest.t_pose
+    unit: LengthUnit = LengthUnit.cm
+    joints: int = 77
+
+    def __post_init__(self) -> None:
+        """Refuse another number of joints."""
+        super().__post_init__()
+        if self.joints not in (77, 78):
+            raise InputError(
+                "bvh.joints", got=self.joints, expected="77, or 78 with a Root", fix="Leave it out."
+            )
 
 
 @dataclass(kw_only=True)

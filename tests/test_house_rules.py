@@ -66,7 +66,8 @@ HEAVY = {"torch", "warp", "pxr", "trimesh"}
 PUBLIC_NAMES = {
     "soma_core": """
         AnalyticalOptions AssetError AutogradOptions BackendError CanonicalMesh HINGES Identity IdentityFit
-        InputError InversionResult Motion NativeFit NativeMotion NativeTransfer PoseInversion PosePriors
+        InputError InversionResult Motion NativeFit NativeMotion NativeTransfer ParameterFit PoseInversion
+        PosePriors
         Posed Rig Sam3dFrames ShapeSpace SkinnedClip SmplMotion SomaError SomaLayer USER_JOINTS
         VertexSequence __version__ assets_dir default_registry diagnose_fit fit_identity load_canonical
         load_shape_space
@@ -81,8 +82,8 @@ PUBLIC_NAMES = {
     """,
     "soma_core.plugin": """
         API_VERSION Axis BackendSpec BrokenBackendError Check CheckFailedError ClosestFaces FileNeeded
-        Generator HasLinearBasis HasPosed HasRandomPoses HasSkinning HasTriangles Level LinearBasis
-        Parameter PluginError Registry SkinnedModel Unit WrapPair atomic_arrays atomic_write
+        Generator HasLinearBasis HasPoseVector HasPosed HasRandomPoses HasSkinning HasTriangles Level
+        LinearBasis Parameter PluginError Registry SkinnedModel Unit WrapPair atomic_arrays atomic_write
         axis_angle_to_matrix
         cached_arrays check closest_point_on_triangle content_key data_dir file_sha256 hookimpl
         open_npz_file read_obj read_pickled_arrays refuse_unreadable write_obj

@@ -19,7 +19,7 @@ _NEEDED, _SIZE = ("fx", "fy", "cx", "cy", "extrinsics"), ("width", "height")
 _EXAMPLE = '{"fx": 1000, "fy": 1000, "cx": 640, "cy": 360, "extrinsics": [[1,0,0,0],[0,-1,0,1],[0,0,-1,3]]}'
 
 _RIGID = 1e-4
-"""Largest entry of |RᵀR - I| accepted: a file with four digits passes, one in which the scale is hidden does not."""
+"""Largest entry of |RᵀR - I| accepted: a file with four digits passes, a matrix that also scales does not."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -79,9 +79,16 @@ def read_camera(path: str | Path) -> Camera:
     missing = [key for key in _NEEDED if key not in values]
     strange = [key for key in values if key not in (*_NEEDED, *_SIZE)]
     if missing or strange or len([key for key in _SIZE if key in values]) == 1:
-        got = f"no {missing[0]}" if missing else f"the key {strange[0]}" if strange else "a width or a height alone"
+        got = (
+            f"no {missing[0]}"
+            if missing
+            else f"the key {strange[0]}"
+            if strange
+            else "a width or a height alone"
+        )
         raise InputError(
-            f"{path}: camera", got=got, expected=f"{', '.join(_NEEDED)}, and {' and '.join(_SIZE)} or neither",
+            f"{path}: camera", got=got,
+            expected=f"{', '.join(_NEEDED)}, and {' and '.join(_SIZE)} or neither",
             fix=f"Write {_EXAMPLE}; distortion is not modelled.",
         )  # fmt: skip
     fx, fy, cx, cy = (_number(path, key, values[key], positive=key[0] == "f") for key in _NEEDED[:4])
@@ -108,9 +115,15 @@ def _extrinsics(path: Path, value: Any) -> np.ndarray:
     except (ValueError, TypeError, OverflowError):
         given = np.empty(0)
     given = given[None] if given.ndim == 2 else given
-    if given.ndim != 3 or given.shape[1:] not in ((3, 4), (4, 4)) or not np.isfinite(given).all() or not len(given):
+    if (
+        given.ndim != 3
+        or given.shape[1:] not in ((3, 4), (4, 4))
+        or not np.isfinite(given).all()
+        or not len(given)
+    ):
         raise InputError(
-            f"{path}: extrinsics", got=f"shape {given.shape}", expected="a 3 x 4 or 4 x 4 matrix, or one a frame",
+            f"{path}: extrinsics", got=f"shape {given.shape}",
+            expected="a 3 x 4 or 4 x 4 matrix, or one a frame",
             fix="Give rotation and translation, world to camera, in metres.",
         )  # fmt: skip
     turns = given[:, :3, :3]

@@ -43,7 +43,7 @@ class MeshFrames:
     """A mesh over time, ready for export.
 
     Attributes:
-        pieces: gives consecutive pieces (f, n, 3) float32 of the frames, from the start each time it is called.
+        pieces: gives consecutive pieces (f, n, 3) float32 of the frames, from the start at each call.
         frame_count, vertex_count: its size.
         triangles: (t, 3) vertex ids.
         counts, indices: polygons, as many vertices as each has and their ids.
@@ -219,7 +219,9 @@ def _obj_faces(mesh: MeshFrames) -> str:
 
 def _refuse_other_files(path: Path) -> None:
     """Refuse to replace a folder that holds what no run of ours has written."""
-    others = [file.name for file in path.iterdir() if not _FRAMES.fullmatch(file.name)] if path.is_dir() else []
+    others = (
+        [file.name for file in path.iterdir() if not _FRAMES.fullmatch(file.name)] if path.is_dir() else []
+    )
     if others:
         raise InputError(
             str(path), got=f"a folder that holds {others[0]}", expected="frames alone, or no folder yet",

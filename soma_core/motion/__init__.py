@@ -18,7 +18,8 @@ if TYPE_CHECKING:
     from soma_core.motion.identities import stored_identity
     from soma_core.motion.options import ConvertOptions, FitOptions, InvertOptions
     from soma_core.motion.played import Played
-    from soma_core.motion.writers import WriteOptions, write_body, write_products
+    from soma_core.motion.products import write_body, write_products
+    from soma_core.motion.writers import WriteOptions
     from soma_core.options import BackendChoice, FrameRange, IdentityChoice, InversionChoice, Picture
 
 __all__ = [
@@ -62,7 +63,8 @@ _HOMES = {
     "soma_core.motion.identities": ["stored_identity"],
     "soma_core.motion.options": ["ConvertOptions", "FitOptions", "InvertOptions"],
     "soma_core.motion.played": ["Played"],
-    "soma_core.motion.writers": ["WriteOptions", "write_body", "write_products"],
+    "soma_core.motion.products": ["write_body", "write_products"],
+    "soma_core.motion.writers": ["WriteOptions"],
     "soma_core.options": ["BackendChoice", "FrameRange", "IdentityChoice", "InversionChoice", "Picture"],
 }
 

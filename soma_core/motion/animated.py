@@ -127,9 +127,11 @@ def animate(
     carried[..., :3, 3] += shift
     return Animated(
         motion=replace(
-            motion, translation=path + shift, rig_revision=layer.rig.revision,
+            motion,
+            translation=path + shift,
+            rig_revision=layer.rig.revision,
             identity=kept_identity(layer, identity),
-        ),  # fmt: skip
+        ),
         transforms=world,
         helpers=carried,
         vertices={frame: vertices[frame] + shift for frame in sorted(vertices)},

@@ -5,10 +5,10 @@ from __future__ import annotations
 import json
 import logging
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 
 from soma_core.cache import atomic_text
@@ -19,19 +19,16 @@ from soma_core.motion.converter import Converted, earlier_report
 from soma_core.motion.files import ResultFiles, fingerprint, layout_of, read
 from soma_core.motion.models import model_settings
 from soma_core.motion.native_errors import NativeErrors
-from soma_core.motion.native_results import NativeTarget, SmplTarget, VertexTarget
+from soma_core.motion.native_results import NativeTarget, ParameterTarget, SmplTarget, VertexTarget
 from soma_core.motion.options import ConvertOptions
 from soma_core.motion.played import MovingBodies, Played
-from soma_core.native import NativeFit, NativeTransfer
+from soma_core.native import NativeFit, NativeTransfer, ParameterFit
 from soma_core.options import Product, SmplLayout
 from soma_core.progress import progress
 
 __all__ = ["BackConverter"]
 
 _log = logging.getLogger(__name__)
-
-_SEARCHED = 20
-"""Frames, spread over the motion, that a body is found from."""
 
 
 class BackConverter:
@@ -44,7 +41,7 @@ class BackConverter:
     def __init__(self, options: ConvertOptions) -> None:
         self._options = options
         self._bodies = MovingBodies(options, options.backend, str(options.translation))
-        self._targets: dict[str, NativeFit | NativeTransfer] = {}
+        self._targets: dict[str, NativeFit | NativeTransfer | ParameterFit] = {}
 
     @torch.no_grad()
     def __call__(self, path: Path, files: ResultFiles, chunks: Path) -> Converted:
@@ -72,8 +69,8 @@ class BackConverter:
             return Converted(report=earlier, files=files, earlier=True, vertices=vertices, written=results)
         kept = FittedChunks(chunks, settings, frame_count=motion.frame_count, size=self._options.chunk)
         body = self._bodies.played(layer, stored, motion)
-        if isinstance(target, SmplTarget) and target.params is None:
-            target = target.of_body(_found_params(kept.folder / "params.json", target, body))
+        if not isinstance(target, VertexTarget) and target.params is None:
+            target = replace(target, params=_found_params(kept.folder / "params.json", target, body))
             settings["found"] = target.params
         _convert_missing(body, target, kept)
         figures = target.write(kept, files, fps=motion.fps, source=motion.source)
@@ -92,12 +89,9 @@ class BackConverter:
                 self._targets[name] = NativeTransfer(name, **kind)
             products = tuple(chosen.shown or [Product.vertices])
             return VertexTarget(transfer=self._targets[name], products=products)
-        if name not in SMPL_JOINTS:
-            raise InputError(
-                "result", got=f"poses of {name}", expected=f"poses of one of {', '.join(SMPL_JOINTS)}",
-                fix="Pass result=vertices; in Python, NativeFit gives the poses of other skinned models.",
-            )  # fmt: skip
         own = stored if stored["backend"] == name and "rest" not in stored else {}
+        if name not in SMPL_JOINTS:
+            return self._parameter_target(own, kind)
         gender = str(chosen.gender or own.get("options", {}).get("gender", "neutral"))
         params = {"betas": list(chosen.betas)} if chosen.betas is not None else own.get("params")
         if gender not in self._targets:
@@ -109,14 +103,27 @@ class BackConverter:
             layout=str(chosen.layout or SmplLayout.amass),
         )  # fmt: skip
 
+    def _parameter_target(self, own: Mapping[str, Any], kind: Mapping[str, Any]) -> NativeTarget:
+        """What becomes of the body in a model whose pose is one vector."""
+        chosen, name = self._options, self._options.to
+        for setting in ("up", "gender", "betas", "num_betas", "layout"):
+            if getattr(chosen, setting) is not None:
+                raise InputError(
+                    setting, got=str(getattr(chosen, setting)), expected=f"none with to={name}",
+                    fix=f"Leave {setting} out.",
+                )  # fmt: skip
+        if name not in self._targets:
+            self._targets[name] = ParameterFit(name, options=own.get("options"), **kind)
+        fit = self._targets[name]
+        return ParameterTarget(
+            fit=fit, errors=NativeErrors(fit.transfer, kind["lod"]), model=name, params=own.get("params")
+        )
 
-def _found_params(file: Path, target: SmplTarget, body: Played) -> dict[str, list[float]]:
+
+def _found_params(file: Path, target: SmplTarget | ParameterTarget, body: Played) -> dict[str, list[float]]:
     """Parameters of the model's body that comes nearest, or those that an earlier run found."""
     if not file.is_file():
-        frames = body.motion.frame_count
-        spread = np.unique(np.linspace(0, frames - 1, min(_SEARCHED, frames)).round().astype(int))
-        _log.info("finding the body from %d frames", len(spread))
-        found = target.fit.fit_params(body.posed(spread))
+        found = target.find(body)
         atomic_text(file, json.dumps({name: value[0].tolist() for name, value in found.items()}))
     return dict(json.loads(file.read_text(encoding="utf-8")))
 

@@ -59,6 +59,11 @@ class FittedChunks:
 
         atomic_write(self._file(number), write)
 
+    def names(self, number: int) -> list[str]:
+        """What a chunk that was stored holds."""
+        with open(self._file(number), "rb") as stream, np.load(stream, allow_pickle=False) as file:
+            return list(file.files)
+
     def load(self, number: int, *names: str) -> tuple[np.ndarray, ...]:
         """The named arrays of a chunk that was stored."""
         with open(self._file(number), "rb") as stream, np.load(stream, allow_pickle=False) as file:

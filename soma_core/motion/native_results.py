@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 import logging
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -13,23 +13,30 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from soma_core.cache import atomic_write
+from soma_core.cache import atomic_arrays
 from soma_core.io.amass import Gender, SmplMotion, SmplName, write_amass, write_smplx
 from soma_core.io.vertex_sequence import UpAxis
 from soma_core.io.vertex_writers import MeshFrames
 from soma_core.motion.chunks import FittedChunks
 from soma_core.motion.files import ResultFiles
 from soma_core.motion.native_errors import NativeErrors
+from soma_core.motion.played import Played
 from soma_core.motion.writers import WRITERS
-from soma_core.native import NativeFit, NativeTransfer
+from soma_core.native import NativeFit, NativeTransfer, ParameterFit
 from soma_core.options import Product
 from soma_core.topology.frames import METRES, native_to_canonical
 
-__all__ = ["NativeTarget", "SmplTarget", "VertexTarget"]
+__all__ = ["NativeTarget", "ParameterTarget", "SmplTarget", "VertexTarget"]
 
 _log = logging.getLogger(__name__)
 
 _PER_FRAME = ("valid", "converged", "iterations", "mean_error", "largest_error")
+_OWN = "own_"
+"""Begins the names of a model's own arrays in a chunk."""
+
+_SEARCHED = 20
+"""Frames, spread over the motion, that a body is found from."""
+
 _USUAL_BETAS, _MOST_USUAL_BETAS = 10, 16
 """Coefficients that the models' own code takes unless told otherwise, and as many as files of AMASS hold."""
 
@@ -131,9 +138,12 @@ class SmplTarget:
             )  # fmt: skip
             object.__setattr__(self, "params", {**(self.params or {}), "betas": betas[: self.width]})
 
-    def of_body(self, params: Mapping[str, list[float]]) -> SmplTarget:
-        """The same for a body that was found."""
-        return replace(self, params=params)
+    def find(self, body: Played) -> Mapping[str, Tensor]:
+        """Parameters of the model's body that comes nearest to frames spread over a motion."""
+        frames = body.motion.frame_count
+        spread = np.unique(np.linspace(0, frames - 1, min(_SEARCHED, frames)).round().astype(int))
+        _log.info("finding the body from %d frames", len(spread))
+        return self.fit.fit_params(body.posed(spread))
 
     @property
     def facts(self) -> Mapping[str, Any]:
@@ -141,7 +151,7 @@ class SmplTarget:
         params = "found" if self.params is None else dict(self.params)
         return {
             "to": self.model, "gender": self.gender, "params": params, "up": self.up,
-            "num_betas": self.width, "layout": self.layout,
+            "num_betas": self.width, "to_layout": self.layout,
         }  # fmt: skip
 
     def results(self, files: ResultFiles) -> dict[str, Path]:
@@ -172,9 +182,10 @@ class SmplTarget:
         )
         extra = {"source": np.array(source), "up_axis": np.array(self.up[1:].upper())}
         (write_amass if self.layout == "amass" else write_smplx)(motion, files.motion, extra=extra)
-        frames = {name: np.concatenate(list(_column(chunks, name))) for name in _PER_FRAME}
-        atomic_write(files.frames, lambda path: np.savez_compressed(path, **frames))
-        return self._figures(chunks, frames)
+        (determined,) = chunks.load(0, "determined")
+        names = zip(self.fit.joint_names, determined, strict=True)
+        unknown = [name for name, known in names if not known]
+        return {"undetermined_joints": unknown, **_figures(chunks, files, self.errors)}
 
     def _betas(self) -> np.ndarray:
         """Coefficients of the width that is written, zeros at the end: other tools multiply all of them."""
@@ -184,18 +195,72 @@ class SmplTarget:
         width = self.width or usual
         return np.pad(own, (0, width - len(own)))
 
-    def _figures(self, chunks: FittedChunks, frames: Mapping[str, np.ndarray]) -> dict[str, Any]:
-        parts = [dict(zip(_SUMMED, arrays, strict=True)) for arrays in chunks.load_all(*_SUMMED)]
-        (determined,) = chunks.load(0, "determined")
-        names = zip(self.fit.joint_names, determined, strict=True)
-        valid = int(frames["valid"].sum())
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class ParameterTarget:
+    """Pose parameters of a model whose pose is one vector, such as MHR, under that model's own names.
+
+    Attributes:
+        fit: to the model.
+        errors: by regions of its mesh.
+        model: name of its backend.
+        params: the body; None while it is yet to be found.
+    """
+
+    fit: ParameterFit
+    errors: NativeErrors
+    model: str
+    params: Mapping[str, Any] | None
+
+    @property
+    def facts(self) -> Mapping[str, Any]:
+        """The body."""
+        return {"to": self.model, "params": "found" if self.params is None else dict(self.params)}
+
+    def results(self, files: ResultFiles) -> dict[str, Path]:
+        """One file of parameters."""
+        return {"npz": files.motion}
+
+    def find(self, body: Played) -> Mapping[str, Tensor]:
+        """Parameters of the model's body that comes nearest to the T-pose."""
+        _log.info("finding the body from its T-pose")
+        layer = body.layer
+        still = torch.zeros(1, len(layer.joint_names), 3, device=layer.device, dtype=layer.dtype)
+        return self.fit.fit_params(layer.pose(body.identity, still).vertices)
+
+    def arrays(self, vertices: Tensor) -> dict[str, np.ndarray]:
+        """Parameters of the frames, and statistics of the error."""
+        found = self.fit(vertices, params=self.params)
+        own = self.fit.generator.own_arrays(found.params, found.parameters)
         return {
-            "frames": chunks.frame_count,
-            "unusable_frames": chunks.frame_count - valid,
-            "converged_share": int(frames["converged"].sum()) / valid if valid else None,
-            "undetermined_joints": [name for name, known in names if not known],
-            "error_mm": self.errors.figures(parts),
+            **{_OWN + name: value.float().cpu().numpy() for name, value in own.items()},
+            "valid": found.valid.cpu().numpy(),
+            "converged": found.converged.cpu().numpy(),
+            "iterations": found.iterations.cpu().numpy(),
+            **self.errors.statistics(found.vertex_error.float().cpu().numpy()),
         }
+
+    def write(self, chunks: FittedChunks, files: ResultFiles, *, fps: float, source: str) -> dict[str, Any]:
+        """Write ``files.motion`` with the model's own arrays, and ``files.frames``."""
+        names = [name for name in chunks.names(0) if name.startswith(_OWN)]
+        own = {name[len(_OWN) :]: np.concatenate(list(_column(chunks, name))) for name in names}
+        told = {"model": self.model, "fps": fps, "source": source}
+        atomic_arrays(files.motion, own | {name: np.asarray(value) for name, value in told.items()})
+        return _figures(chunks, files, self.errors)
+
+
+def _figures(chunks: FittedChunks, files: ResultFiles, errors: NativeErrors) -> dict[str, Any]:
+    """Write what became of each frame; how far the model's vertices lie from the body's, for the report."""
+    frames = {name: np.concatenate(list(_column(chunks, name))) for name in _PER_FRAME}
+    atomic_arrays(files.frames, frames)
+    parts = [dict(zip(_SUMMED, arrays, strict=True)) for arrays in chunks.load_all(*_SUMMED)]
+    valid = int(frames["valid"].sum())
+    return {
+        "frames": chunks.frame_count,
+        "unusable_frames": chunks.frame_count - valid,
+        "converged_share": int(frames["converged"].sum()) / valid if valid else None,
+        "error_mm": errors.figures(parts),
+    }
 
 
 def _column(chunks: FittedChunks, name: str) -> Iterator[np.ndarray]:

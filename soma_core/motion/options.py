@@ -159,11 +159,5 @@ class ConvertOptions(WriteOptions, FitOptions):
                 expected=f"with to={self.to}, npz for its poses, or its mesh: {', '.join(MESH_WRITERS)}",
                 fix="Leave to out for this skeleton." if strange else "Run it once for each.",
             )  # fmt: skip
-        for name in ("joints", "camera", "write_up"):
-            if getattr(self, name) is not None:
-                raise InputError(
-                    name,
-                    got=str(getattr(self, name)),
-                    expected=f"none with to={self.to}",
-                    fix=f"Leave {name} out.",
-                )
+        for name, value in self.given().items():
+            raise InputError(name, got=value, expected=f"none with to={self.to}", fix=f"Leave {name} out.")

@@ -1,22 +1,32 @@
-"""What is written of a converted motion beside it: its body, posed, as any of the products."""
+"""A motion on its body, written as what the table of writers has."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
-from dataclasses import asdict
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from soma_core.cache import atomic_text
+from soma_core.io.bvh import write_bvh
+from soma_core.io.camera import Camera, read_camera
+from soma_core.io.motion import Motion
 from soma_core.io.motion_files import read_motion
-from soma_core.motion.files import ResultFiles, fingerprint
+from soma_core.layer import SomaLayer
+from soma_core.motion.files import ResultFiles, fingerprint, write
 from soma_core.motion.models import model_settings
 from soma_core.motion.options import ConvertOptions
-from soma_core.motion.played import MovingBodies
-from soma_core.motion.writers import WRITERS, write_products
+from soma_core.motion.played import MovingBodies, Played
+from soma_core.motion.writers import WRITERS, WriteOptions
+from soma_core.options import BvhChoice, Picture, Product
+from soma_core.skeleton.identity import Identity
+from soma_core.view.picture import backend_colour, contact_sheet
+from soma_core.view.stage import Body
 
-__all__ = ["BodyProducts"]
+__all__ = ["BodyProducts", "draw_contact_sheet", "write_body", "write_bvh_file", "write_motion_npz", "write_products"]
 
 
 class BodyProducts:
@@ -63,7 +73,7 @@ class BodyProducts:
             "content": fingerprint(path), **model_settings(layer), "backend": layer.backend,
             "params": stored.get("params"), "options": layer.options, "translation": str(options.translation),
             "joints": options.joints, "camera": camera, "write_up": options.write_up,
-            "picture": asdict(options.picture),
+            "bvh": asdict(options.bvh), "picture": asdict(options.picture),
         }  # fmt: skip
         settings = json.loads(json.dumps(settings, default=str))
         places = {product: files.product(product) for product in options.shown}
@@ -78,3 +88,125 @@ class BodyProducts:
         }
         atomic_text(files.report, json.dumps(report, indent=2, default=float) + "\n")
         return {str(product): places[product] for product in WRITERS if product in places}
+
+
+def write_products(
+    played: Played,
+    products: Iterable[Product],
+    place: Callable[[Product], Path],
+    *,
+    options: WriteOptions | None = None,
+    picture: Picture | None = None,
+) -> dict[str, Path]:
+    """Write a motion on its body as some products, each atomically and in bounded memory.
+
+    Args:
+        played: the motion on its body.
+        products: which, of `WRITERS`.
+        place: where each goes.
+        options: how.
+        picture: of the contact sheet.
+
+    Returns:
+        Name of each product and where it was written.
+
+    Raises:
+        InputError: a joint that is none, or a camera that is none.
+    """
+    options, wanted, written = options or WriteOptions(), set(products), {}
+    turned = replace(played, up=f"+{options.write_up or 'y'}")
+    made: dict[str, tuple[Any, ...]] = {}
+    for product, writer in WRITERS.items():
+        if product not in wanted:
+            continue
+        if writer.needs not in made:
+            made[writer.needs] = _NEEDED[writer.needs](played, turned, options, picture or Picture())
+        writer.write(place(product), *made[writer.needs])
+        written[str(product)] = place(product)
+    return written
+
+
+def write_body(path: str | Path, layer: SomaLayer, identity: Identity, motion: Motion) -> None:
+    """Write a body that moves as one file with mesh, skeleton, skin, correctives and animation, atomically.
+
+    Args:
+        path: ``.glb`` (glTF), ``.usdc``, ``.usda`` or ``.usd`` (UsdSkel), ``.html`` (a page that plays it).
+        layer: the forward path.
+        identity: one identity.
+        motion: how it moves; metres, +Y up, taken as it stands.
+
+    Raises:
+        InputError: another suffix, or an identity that is a batch.
+    """
+    product = {".glb": Product.glb, ".html": Product.html}.get(Path(path).suffix, Product.usd)
+    played = Played(layer=layer, identity=identity, motion=motion)
+    WRITERS[product].write(Path(path), *_NEEDED["body"](played))
+
+
+def _camera(options: WriteOptions) -> Camera:
+    return read_camera(str(options.camera))
+
+
+_NEEDED: Mapping[str, Callable[..., tuple[Any, ...]]] = {
+    "motion": lambda played, *_: (played.motion,),
+    "rotations": lambda played, _, options, __: (played, options.bvh),
+    "joints": lambda _, turned, options, __: (turned.joints(options.joints),),
+    "view": lambda played, _, options, __: (played.joints(options.joints), _camera(options)),
+    "vertices": lambda _, turned, *__: (turned.meshes(),),
+    "body": lambda played, *_: (played.clip(_metadata(played)),),
+    "pictures": lambda played, _, __, picture: (played, picture),
+}
+"""What each kind of writer takes after the path; a camera sees the world as it is, +Y up."""
+
+
+def write_motion_npz(path: Path, motion: Motion) -> None:
+    """Write a motion in this project's schema."""
+    write(motion, path)
+
+
+def write_bvh_file(path: Path, played: Played, choice: BvhChoice) -> None:
+    """Write the motion on the body's own bones as BVH."""
+    bind = played.identity.bind_world[0].detach().cpu().double().numpy()
+    write_bvh(
+        played.motion, path, rig=played.layer.rig, bind_world=bind, joints=choice.joints,
+        order=str(choice.order), rest=str(choice.rest), unit=str(choice.unit),
+    )  # fmt: skip
+
+
+def draw_contact_sheet(path: Path, played: Played, picture: Picture) -> None:
+    """Draw frames of a motion, the middles of equal parts of it: both its ends are often the same pose."""
+    count, total = picture.frames, played.motion.frame_count
+    layer, bodies = played.layer, []
+    for frame in np.unique(((np.arange(count) + 0.5) * total / count).astype(int)).tolist():
+        vertices = played.posed(slice(frame, frame + 1))[0].cpu().numpy()
+        bodies.append(
+            Body(
+                vertices=vertices,
+                triangles=layer.mesh.triangles,
+                colour=backend_colour(layer.backend),
+                caption=f"{frame / played.motion.fps:.2f} s",
+            )
+        )
+    contact_sheet(path, bodies, width=picture.width)
+
+
+def _rounded(value: Any) -> Any:
+    """Numbers to six digits, which is what float32 holds of them."""
+    if isinstance(value, Mapping):
+        return {name: _rounded(one) for name, one in value.items()}
+    if isinstance(value, list | tuple):
+        return [_rounded(one) for one in value]
+    return value if isinstance(value, str) else float(f"{float(value):.6g}")
+
+
+def _metadata(played: Played) -> dict[str, str]:
+    """Texts that travel with the exported body."""
+    layer, motion = played.layer, played.motion
+    return {
+        "backend": layer.backend,
+        "licence": layer.spec.licence,
+        "identity": json.dumps(_rounded(motion.identity.get("params", {})), sort_keys=True),
+        "rig_revision": layer.rig.revision,
+        "motion": motion.source,
+        "motion_licence": motion.licence,
+    }

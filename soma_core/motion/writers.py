@@ -6,30 +6,15 @@ A row's function is imported when it is used: options and help texts cost no tor
 from __future__ import annotations
 
 import importlib
-import json
-from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, field, replace
+from collections.abc import Iterable
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 from soma_core.errors import InputError
-from soma_core.options import Options, Picture, Product, Upward
+from soma_core.options import BvhChoice, Options, Product, Upward
 
-if TYPE_CHECKING:
-    from soma_core.layer import SomaLayer
-    from soma_core.skeleton.identity import Identity
-    from soma_core.io.motion import Motion
-    from soma_core.motion.played import Played
-
-__all__ = [
-    "MESH_WRITERS",
-    "WRITERS",
-    "WriteOptions",
-    "Writer",
-    "listed_writers",
-    "write_body",
-    "write_products",
-]
+__all__ = ["MESH_WRITERS", "WRITERS", "WriteOptions", "Writer", "listed_writers"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -38,15 +23,15 @@ class Writer:
 
     Attributes:
         file: what it is called in a folder of its own; without a suffix it is a folder of files.
-        needs: of the motion: itself, its joints, those before a camera, vertices, mesh and skeleton, or
-            pictures.
+        needs: of the motion: itself, its rotations on the body's bones, its joints, those before a camera,
+            vertices, mesh and skeleton, or pictures.
         function: ``module:name`` of what writes it; takes the path, and what is needed.
         summary: for people.
         settings: fields of ``WriteOptions`` that it takes.
     """
 
     file: str
-    needs: Literal["motion", "joints", "view", "vertices", "body", "pictures"]
+    needs: Literal["motion", "rotations", "joints", "view", "vertices", "body", "pictures"]
     function: str
     summary: str
     settings: tuple[str, ...] = field(default=())
@@ -61,8 +46,12 @@ _IO, _UP = "soma_core.io", ("write_up",)
 
 WRITERS: dict[Product, Writer] = {
     Product.npz: Writer(
-        file="motion.npz", needs="motion", function=f"{__name__}:write_motion_npz",
+        file="motion.npz", needs="motion", function="soma_core.motion.products:write_motion_npz",
         summary="the motion in this project's schema, which the SOMA tools read",
+    ),
+    Product.bvh: Writer(
+        file="motion.bvh", needs="rotations", function="soma_core.motion.products:write_bvh_file",
+        summary="the skeleton of the body and its Euler angles", settings=("bvh",),
     ),
     Product.joints: Writer(
         file="joints.npz", needs="joints", function=f"{_IO}.joint_files:write_joints_npz",
@@ -113,7 +102,7 @@ WRITERS: dict[Product, Writer] = {
         summary="a page that plays the body in a browser, with no server and no network",
     ),
     Product.png: Writer(
-        file="contact_sheet.png", needs="pictures", function=f"{__name__}:draw_contact_sheet",
+        file="contact_sheet.png", needs="pictures", function="soma_core.motion.products:draw_contact_sheet",
         summary="frames of the clip",
     ),
 }  # fmt: skip
@@ -139,11 +128,27 @@ class WriteOptions(Options):
         joints: names of the joints that are written, in this order; None: all.
         camera: JSON file of the camera that sees keypoints; see ``soma_core.io.camera``.
         write_up: upward axis of the world of joints and vertices; None: y.
+        bvh: of that format.
     """
 
     joints: list[str] | None = None
     camera: str | None = None
     write_up: Upward | None = None
+    bvh: BvhChoice = field(default_factory=BvhChoice)
+
+    def given(self) -> dict[str, str]:
+        """The settings that are not as usual, as text."""
+        usual, found = WriteOptions.__dataclass_fields__, {}
+        for name in usual:
+            value = getattr(self, name)
+            if isinstance(value, BvhChoice):
+                changed = {
+                    key: str(each) for key, each in vars(value).items() if each != vars(BvhChoice())[key]
+                }
+                value = ", ".join(f"{key}={each}" for key, each in changed.items()) or None
+            if value is not None:
+                found[name] = str(value)
+        return found
 
     def refuse_unused(self, products: Iterable[Product]) -> None:
         """Refuse settings that nothing among `products` takes, and products whose settings are missing.
@@ -152,12 +157,12 @@ class WriteOptions(Options):
             InputError: the first one, with the products that would take it.
         """
         products = list(products)
-        for name in ("joints", "camera", "write_up"):
-            value, takers = getattr(self, name), [key for key, row in WRITERS.items() if name in row.settings]
-            if value is None or set(takers) & set(products):
+        for name, value in self.given().items():
+            takers = [key for key, row in WRITERS.items() if name in row.settings]
+            if set(takers) & set(products):
                 continue
             raise InputError(
-                name, got=str(value), expected=f"none with write=[{','.join(products)}]",
+                name, got=value, expected=f"none with write=[{','.join(products)}]",
                 fix=f"Leave {name} out, or write one of {', '.join(takers)}.",
             )  # fmt: skip
         if Product.keypoints in products and self.camera is None:
@@ -165,127 +170,3 @@ class WriteOptions(Options):
                 "camera", got="none", expected="the camera that sees the keypoints",
                 fix="Pass camera=FILE.json with fx, fy, cx, cy and extrinsics.",
             )  # fmt: skip
-
-
-def write_products(
-    played: Played,
-    products: Iterable[Product],
-    place: Callable[[Product], Path],
-    *,
-    options: WriteOptions | None = None,
-    picture: Picture | None = None,
-) -> dict[str, Path]:
-    """Write a motion on its body as some products, each atomically and in bounded memory.
-
-    Args:
-        played: the motion on its body.
-        products: which, of `WRITERS`.
-        place: where each goes.
-        options: how.
-        picture: of the contact sheet.
-
-    Returns:
-        Name of each product and where it was written.
-
-    Raises:
-        InputError: a joint that is none, or a camera that is none.
-    """
-    options, wanted, written = options or WriteOptions(), set(products), {}
-    turned = replace(played, up=f"+{options.write_up or 'y'}")
-    made: dict[str, tuple[Any, ...]] = {}
-    for product, writer in WRITERS.items():
-        if product not in wanted:
-            continue
-        if writer.needs not in made:
-            made[writer.needs] = _NEEDED[writer.needs](played, turned, options, picture or Picture())
-        writer.write(place(product), *made[writer.needs])
-        written[str(product)] = place(product)
-    return written
-
-
-def write_body(path: str | Path, layer: SomaLayer, identity: Identity, motion: Motion) -> None:
-    """Write a body that moves as one file with mesh, skeleton, skin, correctives and animation, atomically.
-
-    Args:
-        path: ``.glb`` (glTF), ``.usdc``, ``.usda`` or ``.usd`` (UsdSkel), ``.html`` (a page that plays it).
-        layer: the forward path.
-        identity: one identity.
-        motion: how it moves; metres, +Y up, taken as it stands.
-
-    Raises:
-        InputError: another suffix, or an identity that is a batch.
-    """
-    from soma_core.motion.played import Played
-
-    product = {".glb": Product.glb, ".html": Product.html}.get(Path(path).suffix, Product.usd)
-    played = Played(layer=layer, identity=identity, motion=motion)
-    WRITERS[product].write(Path(path), *_NEEDED["body"](played))
-
-
-def _view(played: Played, turned: Played, options: WriteOptions, picture: Picture) -> tuple[Any, ...]:  # noqa: ARG001
-    """Joints and the camera that sees them; its world is +Y up."""
-    from soma_core.io.camera import read_camera
-
-    return played.joints(options.joints), read_camera(str(options.camera))
-
-
-_NEEDED: Mapping[str, Callable[..., tuple[Any, ...]]] = {
-    "motion": lambda played, *_: (played.motion,),
-    "joints": lambda _, turned, options, picture: (turned.joints(options.joints),),  # noqa: ARG005
-    "view": _view,
-    "vertices": lambda _, turned, *__: (turned.meshes(),),
-    "body": lambda played, *_: (played.clip(_metadata(played)),),
-    "pictures": lambda played, _, __, picture: (played, picture),
-}
-"""What each kind of writer takes after the path."""
-
-
-def write_motion_npz(path: Path, motion: Motion) -> None:
-    """Write a motion in this project's schema."""
-    from soma_core.motion.files import write
-
-    write(motion, path)
-
-
-def draw_contact_sheet(path: Path, played: Played, picture: Picture) -> None:
-    """Draw frames of a motion, the middles of equal parts of it: both its ends are often the same pose."""
-    import numpy as np
-
-    from soma_core.view.picture import backend_colour, contact_sheet
-    from soma_core.view.stage import Body
-
-    count, total = picture.frames, played.motion.frame_count
-    layer, bodies = played.layer, []
-    for frame in np.unique(((np.arange(count) + 0.5) * total / count).astype(int)).tolist():
-        vertices = played.posed(slice(frame, frame + 1))[0].cpu().numpy()
-        bodies.append(
-            Body(
-                vertices=vertices,
-                triangles=layer.mesh.triangles,
-                colour=backend_colour(layer.backend),
-                caption=f"{frame / played.motion.fps:.2f} s",
-            )  # fmt: skip
-        )
-    contact_sheet(path, bodies, width=picture.width)
-
-
-def _rounded(value: Any) -> Any:
-    """Numbers to six digits, which is what float32 holds of them."""
-    if isinstance(value, Mapping):
-        return {name: _rounded(one) for name, one in value.items()}
-    if isinstance(value, list | tuple):
-        return [_rounded(one) for one in value]
-    return value if isinstance(value, str) else float(f"{float(value):.6g}")
-
-
-def _metadata(played: Played) -> dict[str, str]:
-    """Texts that travel with the exported body."""
-    layer, motion = played.layer, played.motion
-    return {
-        "backend": layer.backend,
-        "licence": layer.spec.licence,
-        "identity": json.dumps(_rounded(motion.identity.get("params", {})), sort_keys=True),
-        "rig_revision": layer.rig.revision,
-        "motion": motion.source,
-        "motion_licence": motion.licence,
-    }

@@ -2,6 +2,7 @@
 
 from soma_core.native.fit import NativeFit
 from soma_core.native.motion import NativeMotion
+from soma_core.native.parameters import ParameterFit, ParameterMotion
 from soma_core.native.transfer import NativeTransfer
 
-__all__ = ["NativeFit", "NativeMotion", "NativeTransfer"]
+__all__ = ["NativeFit", "NativeMotion", "NativeTransfer", "ParameterFit", "ParameterMotion"]

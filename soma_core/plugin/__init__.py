@@ -31,6 +31,7 @@ if TYPE_CHECKING:
         Generator,
         HasLinearBasis,
         HasPosed,
+        HasPoseVector,
         HasRandomPoses,
         HasSkinning,
         HasTriangles,
@@ -53,6 +54,7 @@ __all__ = [
     "FileNeeded",
     "Generator",
     "HasLinearBasis",
+    "HasPoseVector",
     "HasPosed",
     "HasRandomPoses",
     "HasSkinning",
@@ -87,8 +89,8 @@ _HOMES = {
     "soma_core.plugin.hookspecs": ["hookimpl"],
     "soma_core.plugin.spec": [
         *("API_VERSION", "Axis", "BackendSpec", "FileNeeded", "Generator", "HasLinearBasis", "HasPosed"),
-        *("HasRandomPoses", "HasSkinning", "HasTriangles", "LinearBasis", "Parameter", "SkinnedModel"),
-        *("Unit", "WrapPair"),
+        *("HasPoseVector", "HasRandomPoses", "HasSkinning", "HasTriangles", "LinearBasis", "Parameter"),
+        *("SkinnedModel", "Unit", "WrapPair"),
     ],
     # Checks of its own, and the registry that its tests ask
     "soma_core.plugin.checks": ["Check", "CheckFailedError", "Level", "check"],

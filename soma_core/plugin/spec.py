@@ -18,6 +18,7 @@ __all__ = [
     "FileNeeded",
     "Generator",
     "HasLinearBasis",
+    "HasPoseVector",
     "HasPosed",
     "HasRandomPoses",
     "HasSkinning",
@@ -213,6 +214,30 @@ class HasSkinning(Protocol):
 
     def skinning(self, params: Mapping[str, Tensor]) -> SkinnedModel:
         """The bodies of the params of :meth:`Generator.rest`."""
+        ...
+
+
+@runtime_checkable
+class HasPoseVector(Protocol):
+    """Optional capability: a pose is one vector of parameters, which the core fits by evaluating the model.
+
+    Attributes:
+        pose_size: entries of what :meth:`posed` takes as ``{"parameters": (batch, pose_size)}``; zero is the
+            rest mesh.
+        root_size: how many of them, the first, move the body as a whole.
+        heading: which of those turns it about the vertical, in radians.
+    """
+
+    pose_size: int
+    root_size: int
+    heading: int
+
+    def posed(self, params: Mapping[str, Tensor], pose: Any) -> Tensor:
+        """Posed vertices (batch, n, 3) in the native unit, topology and axes."""
+        ...
+
+    def own_arrays(self, params: Mapping[str, Tensor], parameters: Tensor) -> Mapping[str, Tensor]:
+        """Poses (frames, pose_size) of one body under the names that files of the model have."""
         ...
 
 

@@ -14,7 +14,8 @@ from soma_core.motion.animated import animate, load_clip
 from soma_core.motion.identities import backend_of, stored_identity
 from soma_core.motion.models import open_layer
 from soma_core.motion.played import Played
-from soma_core.motion.writers import WRITERS, write_products
+from soma_core.motion.products import write_products
+from soma_core.motion.writers import WRITERS
 
 if TYPE_CHECKING:
     from omegaconf import DictConfig

@@ -29,7 +29,8 @@ POINTS = np.random.default_rng(0).standard_normal((FRAMES, 5, 3)).astype(np.floa
 
 def frames(**changes):
     shown = {
-        "pieces": lambda: iter((POINTS[:2], POINTS[2:])), "frame_count": FRAMES, "vertex_count": 5, "fps": FPS,
+        "pieces": lambda: iter((POINTS[:2], POINTS[2:])), "frame_count": FRAMES, "vertex_count": 5,
+        "fps": FPS,
         "triangles": np.array([[0, 1, 2], [0, 2, 3], [0, 3, 4]]), "counts": COUNTS, "indices": INDICES,
         "uv": UV, "uv_indices": INDICES[::-1], "up": "+z", "source": "a\nwalk",
     }  # fmt: skip

@@ -8,20 +8,35 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from scipy.spatial.transform import Rotation
 
 from soma_core import SomaLayer
 from soma_core.cli import EXIT_OK, EXIT_USAGE, main
 from soma_core.errors import InputError
 from soma_core.io import open_vertex_sequence, write_motion
-from soma_core.motion import BackendChoice, ConvertOptions, convert_file, convert_folder, load_clip, played, write_products
+from soma_core.motion import (
+    BackendChoice,
+    ConvertOptions,
+    convert_file,
+    convert_folder,
+    load_clip,
+    played,
+    write_products,
+)
 from soma_core.motion.writers import MESH_WRITERS, WRITERS, listed_writers
-from soma_core.options import FrameRange, Product
+from soma_core.options import BvhChoice, FrameRange, Product
 
 ROUNDING = 1e-6
 """Metres: float32 at the size of a body."""
 
 BODY = {"backend": "soma", "params": {"shape": [1.0, -0.5]}}
-CAMERA = {"fx": 800, "fy": 800, "cx": 320, "cy": 240, "extrinsics": [[1, 0, 0, 0], [0, -1, 0, 1], [0, 0, -1, 4]]}
+CAMERA = {
+    "fx": 800,
+    "fy": 800,
+    "cx": 320,
+    "cy": 240,
+    "extrinsics": [[1, 0, 0, 0], [0, -1, 0, 1], [0, 0, -1, 4]],
+}
 
 
 @pytest.fixture(scope="module")
@@ -64,7 +79,9 @@ def test_joints_are_those_of_the_layer_and_no_mesh_is_posed(file, posed, tmp_pat
         np.testing.assert_allclose(joints["positions"], posed.joints[:, places], atol=ROUNDING)
         x, y, z = (joints["quaternions"][..., axis] for axis in (1, 2, 3))
         w = joints["quaternions"][..., 0]
-        turned = np.stack([1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)], -1)  # the x axis
+        turned = np.stack(
+            [1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)], -1
+        )  # the x axis
         np.testing.assert_allclose(turned, posed.transforms[:, 1:][:, places, :3, 0], atol=ROUNDING)
     assert found.written == {"npz": tmp_path / "out/motion.npz", "joints": tmp_path / "out/joints.npz"}
 
@@ -101,7 +118,9 @@ def test_products_are_written_once(file, tmp_path, monkeypatch):
     made = []
     monkeypatch.setattr(
         "soma_core.motion.products.write_products",
-        lambda played, products, *rest, **more: made.append(products) or write_products(played, products, *rest, **more),
+        lambda played, products, *rest, **more: (
+            made.append(products) or write_products(played, products, *rest, **more)
+        ),
     )
     for write, settings in (
         (["joints"], {}), (["joints", "csv"], {}), (["joints", "csv"], {}), (["csv"], {"joints": ["Hips"]}),
@@ -142,10 +161,17 @@ def test_the_command_says_what_was_written_where(file, tmp_path, monkeypatch, ca
 @pytest.mark.parametrize(
     ("changes", "said"),
     [
-        ({"joints": ["Hips"]}, r"joints: got \['Hips'\], expected none with write=\[npz\].*or write one of joints, csv"),
+        (
+            {"joints": ["Hips"]},
+            r"joints: got \['Hips'\], expected none with write=\[npz\].*or write one of joints, csv",
+        ),
         ({"write": ["obj"], "camera": "c"}, r"camera: got c, expected none with write=\[obj\]"),
         ({"write": ["glb"], "write_up": "z"}, r"write_up: got z, expected none with write=\[glb\]"),
         ({"write": ["keypoints"]}, r"camera: got none, expected the camera.*camera=FILE\.json"),
+        (
+            {"write": ["obj"], "bvh": BvhChoice(order="XYZ")},
+            r"bvh: got order=XYZ, expected none with write=.obj.",
+        ),
         ({"write": ["abc"]}, "write: got 'abc', expected one of npz, usd, glb"),
         ({"write": [1]}, "write: got 1, expected one of npz"),
     ],
@@ -175,3 +201,62 @@ def test_a_fitted_body_is_written_without_another_fit(smplh_models, amass_file, 
     assert found.report["products"]["files"] == {"pc2": "vertices.pc2"}
     assert json.loads((tmp_path / "report.json").read_text()) == found.report
     assert set(MESH_WRITERS) == {"vertices", "obj", "ply", "pc2", "mdd", "usdpoints"}
+
+
+@pytest.mark.parametrize("choice", [{}, {"order": "XYZ", "rest": "bind", "unit": "m", "joints": 78}])
+def test_a_bvh_has_the_joints_of_the_layer(file, posed, tmp_path, choice):
+    """Parsed here, line by line: offsets, channels, and the walk down the tree."""
+    converted(file, tmp_path, to="bvh", bvh=BvhChoice(**choice))
+    places, names = joints_of_bvh(tmp_path / "motion.bvh")
+    metres = 1.0 if choice else 0.01
+    known = SomaLayer("soma", lod="low").joint_names
+    assert set(known) <= set(names)
+    ours = np.stack([places[:, names.index(name)] for name in known], 1) * metres
+    assert np.abs(ours - posed.joints.numpy()).max() < BVH_ROUNDING
+
+
+BVH_ROUNDING = 2e-6
+"""Metres: the layer is float32."""
+
+
+def joints_of_bvh(path):
+    """World places (frames, J, 3) and names of the joints."""
+    head, _, tail = path.read_text().partition("MOTION")
+    names, parents, offsets, channels, stack = [], [], [], [], []
+    for line in head.splitlines():
+        words = line.split()
+        if words[:1] in (["ROOT"], ["JOINT"]):
+            names.append(words[1])
+            parents.append(stack[-1] if stack else -1)
+        elif words[:1] == ["End"]:
+            names.append("end")
+            parents.append(stack[-1])
+        elif words == ["{"]:
+            stack.append(len(names) - 1)
+        elif words == ["}"]:
+            stack.pop()
+        elif words[:1] == ["OFFSET"]:
+            offsets.append([float(word) for word in words[1:]])
+        elif words[:1] == ["CHANNELS"]:
+            channels += [(len(names) - 1, word) for word in words[2:]]
+    rows = [line.split() for line in tail.strip().splitlines()[2:]]
+    values = np.array(rows, float)
+    turn = np.tile(np.eye(3), (len(values), len(names), 1, 1))
+    place = np.tile(np.array(offsets), (len(values), 1, 1))
+    moved = set()
+    for column, (joint, channel) in zip(values.T, channels, strict=True):
+        axis = "XYZ".index(channel[0])
+        if channel.endswith("position"):
+            if joint not in moved:
+                place[:, joint] = 0
+            moved.add(joint)
+            place[:, joint, axis] = column
+        else:
+            turn[:, joint] = (
+                turn[:, joint] @ Rotation.from_euler("xyz"[axis], column[:, None], degrees=True).as_matrix()
+            )
+    for joint, parent in enumerate(parents):
+        if parent >= 0:
+            place[:, joint] = place[:, parent] + np.einsum("fab,fb->fa", turn[:, parent], place[:, joint])
+            turn[:, joint] = turn[:, parent] @ turn[:, joint]
+    return place, names

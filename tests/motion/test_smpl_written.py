@@ -1,4 +1,4 @@
-"""Poses of SMPL models as they are written, under an evaluator of their own that takes what smplx's code takes."""
+"""Poses of SMPL models as they are written, under an evaluator that takes what smplx's code takes."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ SAME_SHARE = 0.05
 """Of the mean error that the report has: that one leaves the inside of the face out."""
 
 ROUND_TRIP_MM = 0.6
-"""Mean distance of the skin after a motion went to parameters of the model, its mesh, and back to a motion."""
+"""Mean distance of the skin after a motion went to parameters of the model, its mesh, and back."""
 
 
 @pytest.fixture(scope="module")
@@ -51,7 +51,9 @@ def data_folder(tmp_path_factory):
 def motion_file(data_folder):
     """Four frames of the shipped motion on a body of SMPL-X."""
     clip = load_clip(frames=FrameRange(start=0, stop=280, step=90))
-    write_motion(replace(clip, identity={"backend": "smplx", "params": {"betas": BODY}}), data_folder / "m.npz")
+    write_motion(
+        replace(clip, identity={"backend": "smplx", "params": {"betas": BODY}}), data_folder / "m.npz"
+    )
     return data_folder / "m.npz"
 
 
@@ -119,7 +121,7 @@ def test_a_body_model_takes_what_is_written(motion_file, tmp_path, monkeypatch, 
     with np.load(tmp_path / "frames.npz") as frames:
         told = 1e3 * frames["mean_error"].mean()
     assert abs(error - told) < SAME_SHARE * told
-    assert found.report["settings"]["layout"] == changes.get("layout", "amass")
+    assert found.report["settings"]["to_layout"] == changes.get("layout", "amass")
 
 
 def test_there_and_back_as_close_as_the_models_allow(motion_file, tmp_path):
@@ -150,7 +152,10 @@ def test_fewer_betas_than_the_body_has_are_said(motion_file, tmp_path, caplog):
         ({"layout": "smplx"}, "layout: got smplx, expected none with to=soma"),
         ({"to": "smplx", "num_betas": 0}, "num_betas: got 0, expected at least 1"),
         ({"to": "smplx", "layout": "vibe"}, "layout: got 'vibe', expected one of amass, smplx"),
-        ({"to": "smplx", "write": ["joints"]}, "write: got joints, expected with to=smplx, npz for its poses"),
+        (
+            {"to": "smplx", "write": ["joints"]},
+            "write: got joints, expected with to=smplx, npz for its poses",
+        ),
         ({"to": "smplx", "write": ["npz", "obj"]}, "write: got poses and obj, expected with to=smplx"),
         ({"to": "smplx", "write": ["obj"], "write_up": "z"}, "write_up: got z, expected none with to=smplx"),
     ],
@@ -163,7 +168,9 @@ def test_settings_that_do_not_apply_are_refused(changes, said):
 def test_poses_have_no_place_among_vertices(motion_file, tmp_path):
     for changes in ({"num_betas": 10}, {"layout": "smplx"}):
         options = ConvertOptions(to="smplx", lod="low", result="vertices", **changes)
-        with pytest.raises(InputError, match=f"{next(iter(changes))}: got .*, expected none: vertices of smplx"):
+        with pytest.raises(
+            InputError, match=f"{next(iter(changes))}: got .*, expected none: vertices of smplx"
+        ):
             convert_file(motion_file, tmp_path, options=options)
 
 

@@ -28,6 +28,8 @@ class MhrGenerator:
         device: where it was loaded to.
     """
 
+    pose_size, root_size, heading = POSE, 6, 4
+
     def __init__(self, model: Model, device: torch.device) -> None:
         self._model, self._device = model, device
 
@@ -64,6 +66,16 @@ class MhrGenerator:
         count = max(sizes, default=1)
         shared = {name: value.expand(count, -1) for name, value in params.items()}
         return self._evaluate(shared, parameters.expand(count, -1), expression.expand(count, -1))
+
+    def own_arrays(self, params: Mapping[str, Tensor], parameters: Tensor) -> dict[str, Tensor]:
+        """Poses (frames, 130) of one body as SAM 3D Body names them: 204 parameters, shape, expression."""
+        count = len(parameters)
+        shared = {name: value.expand(count, -1) for name, value in params.items()}
+        return {
+            "mhr_model_params": torch.cat((parameters, shared["bone_lengths"], shared["scales"]), 1),
+            "shape_params": shared["identity"],
+            "expr_params": parameters.new_zeros(count, EXPRESSIONS),
+        }
 
     def random_poses(self, count: int, seed: int) -> dict[str, Tensor]:
         """Poses for :meth:`posed`: joint angles about zero, the root at rest.
