@@ -72,12 +72,7 @@ def load_clip(
             expected=f"a step of at least 1 and a range inside the {motion.frame_count} frames",
             fix="Give frames.start, frames.stop and frames.step inside the motion.",
         )
-    return replace(
-        motion,
-        rotations=motion.rotations[part],
-        translation=motion.translation[part],
-        fps=motion.fps / part.step,
-    )
+    return replace(motion.cut(part), fps=motion.fps / part.step)
 
 
 def animate(
