@@ -1,0 +1,222 @@
+"""Feet that stay where they stand: legs bent by inverse kinematics, smoothly in and out of each contact."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from scipy.ndimage import gaussian_filter1d, maximum_filter1d
+from scipy.spatial.transform import Rotation
+
+from soma_core.io.joint_order import CONTACT_JOINTS
+from soma_core.io.motion import Motion
+from soma_core.motion.ground import LOW, SLOW, FootTrack
+from soma_core.rig.skeleton import Rig
+
+__all__ = ["lock_feet"]
+
+_EASE_SECONDS = 0.2
+"""How long a foot takes from its own path to a pinned one, and back."""
+
+_STRETCH = 0.998
+"""Part of its length that a leg is stretched to at most, where the motion did not stretch it further."""
+
+_DEEPEST = 0.05
+"""How far the Hips may sink so that legs reach, in heights of the body; then a foot is let slide."""
+
+_STRAIGHT = 0.02
+"""A knee less far out of the leg's line than this part of it takes its side from where the thigh looks."""
+
+_ROUNDS = 3
+"""Times a leg is bent: exact at the first for a bent knee; a straight one needs the side it bends to."""
+
+
+def lock_feet(
+    motion: Motion,
+    transforms: np.ndarray,
+    track: FootTrack,
+    contacts: np.ndarray,
+    *,
+    rig: Rig,
+    floor: float,
+) -> Motion:
+    """Pin heels and toes in contact, by the hips, knees and ankles of the legs.
+
+    Each contact is held where it is on average, its sole on the floor if it is near. Feet between contacts
+    keep their own path, and thighs the side that the knee bends to. Where a leg does not reach, the Hips sink.
+
+    Args:
+        motion: rotations and path of the Hips [m] of the body that was posed.
+        transforms: (frames, J, 4, 4) its world transforms [m].
+        track: its feet.
+        contacts: (frames, 4) in the order of ``CONTACT_JOINTS``.
+        rig: the skeleton.
+        floor: height of the floor [m].
+    """
+    pins = [
+        _pin(track.joints[:, index], track.soles[:, index], contacts[:, index], motion.fps, track.height, floor)
+        for index in range(len(CONTACT_JOINTS))
+    ]
+    goals = [_foot_goal(track.joints[:, 2 * side :], *pins[2 * side : 2 * side + 2]) for side in (0, 1)]
+    legs = [_Leg(transforms, rig, side) for side in ("Left", "Right")]
+    drops = [leg.drop(ankle) for leg, (ankle, _) in zip(legs, goals, strict=True)]
+    drop = _smooth_drop(np.maximum(*drops), motion.fps, _DEEPEST * track.height)
+    rotations = motion.rotations.astype(np.float64)
+    for leg, (ankle, turn) in zip(legs, goals, strict=True):
+        leg.lower(drop)
+        leg.reach(ankle, turn)
+        leg.store(rotations, absolute=motion.convention == "absolute_local")
+    path = motion.translation - drop[:, None] * [0, 1, 0]
+    return replace(motion, rotations=rotations, translation=path)
+
+
+def _pin(
+    points: np.ndarray, soles: np.ndarray, on: np.ndarray, fps: float, height: float, floor: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Way (frames, 3) [m] of a point to where it is pinned, and how much it is, (frames,) from 0 to 1."""
+    frames, ease = len(points), max(round(_EASE_SECONDS * fps), 1)
+    total, weight = np.zeros((frames, 3)), np.zeros(frames)
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], on, [False]])))
+    for start, stop in edges.reshape(-1, 2):
+        run = slice(start, stop)
+        target = points[run].mean(axis=0)
+        level = np.median(soles[run])
+        target[1] = np.median(points[run, 1] - soles[run]) + (
+            floor if abs(level - floor) < LOW * height else level
+        )
+        change = target - points[run]
+        total[run], weight[run] = change, 1.0
+        for edge, inner, frame, step in ((0, 1, start, -1), (-1, -2, stop - 1, 1)):
+            slope = change[edge] - change[inner] if len(change) > 1 else np.zeros(3)
+            slope *= min(1.0, SLOW * height / fps / max(float(np.linalg.norm(slope)), 1e-12))
+            outside = _until_contact(on, frame + step * np.arange(1, ease + 1))
+            time = np.arange(1, len(outside) + 1)
+            share = (1 + np.cos(np.pi * time / (ease + 1))) / 2
+            total[outside] += share[:, None] * (change[edge] + slope * time[:, None])
+            weight[outside] += share
+    scale = np.maximum(weight, 1e-12)
+    return total / scale[:, None], np.minimum(weight, 1.0)
+
+
+def _until_contact(on: np.ndarray, frames: np.ndarray) -> np.ndarray:
+    """Of consecutive frames, those inside the clip and before the next contact."""
+    inside = frames[(frames >= 0) & (frames < len(on))]
+    return inside[: int(np.argmax(on[inside])) if on[inside].any() else None]
+
+
+def _foot_goal(
+    joints: np.ndarray, heel: tuple[np.ndarray, np.ndarray], toe: tuple[np.ndarray, np.ndarray]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Where an ankle goes (frames, 3) [m], and the turn of its foot in the world (frames, 3, 3).
+
+    A foot that is pinned at one end moves as a whole; pinned at both it is turned to meet both directions,
+    and what its length leaves over is shared.
+    """
+    ankle, ball = joints[:, 0], joints[:, 1]
+    (heel_way, heel_held), (toe_way, toe_held) = ((way, held[:, None]) for way, held in (heel, toe))
+    there = ankle + heel_held * heel_way + (1 - heel_held) * toe_held * toe_way
+    ahead = ball + toe_held * toe_way + (1 - toe_held) * heel_held * heel_way
+    turn = _shortest_arc(ball - ankle, ahead - there)
+    half = (turn @ (ball - ankle)[..., None])[..., 0] / 2
+    return (there + ahead) / 2 - half, turn
+
+
+class _Leg:
+    """One leg of a posed body, frame by frame; world rotations and places in float64."""
+
+    def __init__(self, transforms: np.ndarray, rig: Rig, side: str) -> None:
+        self.rig = rig
+        names = [side + part for part in ("Leg", "Shin", "Foot")]
+        self.joints = [rig.joint_names.index(name) for name in names]
+        self.hips = transforms[:, rig.parents[self.joints[0]], :3, :3].astype(np.float64)
+        moved = transforms[:, self.joints].astype(np.float64)
+        self.turned = [moved[:, index, :3, :3] for index in range(3)]
+        self.hip, self.knee, self.ankle = (moved[:, index, :3, 3] for index in range(3))
+        self.thigh = np.linalg.norm(self.knee - self.hip, axis=1)
+        self.shin = np.linalg.norm(self.ankle - self.knee, axis=1)
+        own = np.linalg.norm(self.ankle - self.hip, axis=1)
+        self.longest = np.maximum(_STRETCH * (self.thigh + self.shin), own)
+
+    def drop(self, ankle: np.ndarray) -> np.ndarray:
+        """How far the hip must sink (frames,) [m] for the ankle to get there."""
+        way = ankle - self.hip
+        level = way[:, 0] ** 2 + way[:, 2] ** 2
+        reach = np.sqrt(np.maximum(self.longest**2 - level, 0))
+        return np.maximum(-way[:, 1] - reach, 0)
+
+    def lower(self, drop: np.ndarray) -> None:
+        """Let the leg sink as it is."""
+        sunk = drop[:, None] * [0, 1, 0]
+        self.hip, self.knee, self.ankle = self.hip - sunk, self.knee - sunk, self.ankle - sunk
+
+    def reach(self, ankle: np.ndarray, turn: np.ndarray) -> None:
+        """Bend the leg until its ankle is there, or stretched towards it; turn the foot in the world."""
+        for _ in range(_ROUNDS):
+            self._bend(ankle)
+        self.turned[2] = turn @ self.turned[2]
+
+    def _bend(self, ankle: np.ndarray) -> None:
+        """Turn thigh and shin in the plane of the leg, then the plane about the hip."""
+        line, far = _unit(self.ankle - self.hip)
+        way, wanted = _unit(ankle - self.hip)
+        wanted = np.clip(wanted, np.abs(self.thigh - self.shin) + 1e-6, self.longest)
+        axis = self._hinge(line)
+        at_hip = _angle(self.thigh, wanted, self.shin) - _angle(self.thigh, far, self.shin)
+        at_ankle = _angle(self.shin, wanted, self.thigh) - _angle(self.shin, far, self.thigh)
+        plane = _shortest_arc(line, way)
+        thigh = plane @ Rotation.from_rotvec(at_hip[:, None] * axis).as_matrix()
+        shin = plane @ Rotation.from_rotvec(-at_ankle[:, None] * axis).as_matrix()
+        knee = self.hip + (thigh @ (self.knee - self.hip)[..., None])[..., 0]
+        self.ankle = knee + (shin @ (self.ankle - self.knee)[..., None])[..., 0]
+        self.knee = knee
+        self.turned[:2] = [thigh @ self.turned[0], shin @ self.turned[1]]
+
+    def _hinge(self, line: np.ndarray) -> np.ndarray:
+        """Axis (frames, 3) that turns the leg's line towards its knee."""
+        out = self.knee - self.hip
+        out = out - (out * line).sum(axis=1, keepdims=True) * line
+        rest = self.rig.t_pose_world[self.joints[0], :3, :3]
+        ahead = (self.turned[0] @ rest.T)[..., 2]  # the body looks along +z in the T-pose
+        ahead = ahead - (ahead * line).sum(axis=1, keepdims=True) * line
+        bent, straight = np.linalg.norm(out, axis=1), _STRAIGHT * self.thigh
+        missing = np.clip(1 - bent / straight, 0, 1) * straight
+        return _unit(np.cross(line, out + missing[:, None] * ahead))[0]
+
+    def store(self, rotations: np.ndarray, *, absolute: bool) -> None:
+        """Write the local rotations of the leg into those of a motion (frames, 77, 3, 3)."""
+        parent = self.hips
+        for joint, world in zip(self.joints, self.turned, strict=True):
+            local = np.swapaxes(parent, -1, -2) @ world
+            if not absolute:
+                above = self.rig.t_pose_world[self.rig.parents[joint], :3, :3]
+                local = above @ local @ self.rig.t_pose_world[joint, :3, :3].T
+            rotations[:, joint - 1] = local
+            parent = world
+
+
+def _smooth_drop(needed: np.ndarray, fps: float, deepest: float) -> np.ndarray:
+    """A smooth way of the Hips (frames,) [m] that is nowhere above what is needed, up to the deepest."""
+    reach = max(round(_EASE_SECONDS * fps), 1)
+    held = maximum_filter1d(np.minimum(needed, deepest), 2 * reach + 1, mode="nearest")
+    return gaussian_filter1d(held, reach / 2, mode="nearest", truncate=2.0)
+
+
+def _angle(beside: np.ndarray, far: np.ndarray, across: np.ndarray) -> np.ndarray:
+    """Angle [rad] between two sides of a triangle of which the third is `across`."""
+    cosine = (beside**2 + far**2 - across**2) / np.maximum(2 * beside * far, 1e-12)
+    return np.arccos(np.clip(cosine, -1, 1))
+
+
+def _unit(vectors: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Directions (n, 3) and lengths (n,)."""
+    lengths = np.linalg.norm(vectors, axis=1)
+    return vectors / np.maximum(lengths, 1e-12)[:, None], lengths
+
+
+def _shortest_arc(source: np.ndarray, target: np.ndarray) -> np.ndarray:
+    """Smallest rotations (n, 3, 3) that turn directions (n, 3) into others."""
+    (source, _), (target, _) = _unit(source), _unit(target)
+    cosine = (source * target).sum(axis=1)
+    quaternions = np.concatenate([np.cross(source, target), 1 + cosine[:, None]], axis=1)
+    quaternions[np.linalg.norm(quaternions, axis=1) < 1e-9] = [1, 0, 0, 0]
+    return Rotation.from_quat(quaternions).as_matrix()
