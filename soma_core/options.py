@@ -19,10 +19,12 @@ __all__ = [
     "AutogradChoice",
     "BackendChoice",
     "BodyGender",
+    "Contacts",
     "ConvertResult",
     "FitLod",
     "FrameRange",
     "Gallery",
+    "Ground",
     "IdentityChoice",
     "IdentityMethod",
     "IdentitySource",
@@ -49,6 +51,13 @@ class BodyGender(StrEnum):
     female = "female"
 
 
+class Contacts(StrEnum):
+    """What becomes of feet in contact with the ground: they go with the legs, or stay where they stand."""
+
+    free = "free"
+    lock = "lock"
+
+
 class ConvertResult(StrEnum):
     """What the way back gives: pose parameters of the model, or vertices."""
 
@@ -68,6 +77,14 @@ class Gallery(StrEnum):
 
     one = "one"
     all = "all"
+
+
+class Ground(StrEnum):
+    """What lies on the floor: soles in contact, the lowest vertex of the clip, or nothing that is sought."""
+
+    contacts = "contacts"
+    lowest = "lowest"
+    none = "none"
 
 
 class IdentityMethod(StrEnum):

@@ -11,9 +11,11 @@ from omegaconf import MISSING
 from soma_core.motion.options import ConvertOptions, InvertOptions
 from soma_core.options import (
     BackendChoice,
+    Contacts,
     FitLod,
     FrameRange,
     Gallery,
+    Ground,
     IdentitySource,
     Kernels,
     LengthUnit,
@@ -55,6 +57,8 @@ class _PlayedMotion(Options):
     identity_from: IdentitySource = IdentitySource.backend
     frames: FrameRange = field(default_factory=FrameRange)
     translation: Translation = Translation.ground
+    ground: Ground | None = None
+    contacts: Contacts = Contacts.free
 
 
 @dataclass(kw_only=True)

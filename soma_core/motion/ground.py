@@ -14,7 +14,7 @@ from soma_core.io.motion import Motion
 from soma_core.rig.mesh import CanonicalMesh
 from soma_core.rig.skeleton import Rig
 
-__all__ = ["FootTrack", "Soles", "contacts_of", "floor_height", "leg_length", "planted_path", "rest_offsets"]
+__all__ = ["FootTrack", "Soles", "contacts_of", "floor_height", "leg_length", "planted_path", "rest_offsets", "standing"]
 
 SLOW = 0.2
 """A foot that is slower than this stands, in heights of the body a second: 0.35 m/s for an adult."""
@@ -144,18 +144,32 @@ def floor_height(heights: np.ndarray, body: float) -> float:
     return float(np.median(ordered[last : ends[last]]))
 
 
-def contacts_of(track: FootTrack, motion: Motion, floor: float | None = None) -> np.ndarray:
-    """Which heels and toes stand in which frames (frames, 4): as the file says, else the low and slow ones.
+def standing(track: FootTrack, motion: Motion) -> tuple[np.ndarray, float]:
+    """Which heels and toes stand (frames, 4), and the height of the floor [m] that they stand on.
+
+    The file's contacts count where it has any. Else the floor is that of the lowest skin of each frame, of
+    knees and hands as well, and on it stands what is low and slow.
+    """
+    if motion.contacts is not None and motion.contacts.any():
+        return motion.contacts, floor_height(track.soles[motion.contacts], track.height)
+    floor = floor_height(track.lowest, track.height)
+    held = contacts_of(track, motion, floor)
+    if held.any():
+        soles = floor_height(track.soles[held], track.height)
+        floor = soles if abs(soles - floor) < _LAYER * track.height else floor
+    return held, floor
+
+
+def contacts_of(track: FootTrack, motion: Motion, floor: float) -> np.ndarray:
+    """Which heels and toes stand (frames, 4): as the file says, else the low and slow ones.
 
     Args:
         track: the feet of the motion.
         motion: with its frame rate.
-        floor: its height [m]; None: as found from the lowest skin of each frame.
+        floor: its height [m].
     """
     if motion.contacts is not None:
         return motion.contacts
-    if floor is None:
-        floor = floor_height(track.lowest, track.height)
     slow = _speeds(track.joints, motion.fps) < SLOW * track.height
     return slow & (track.soles < floor + LOW * track.height)
 

@@ -61,7 +61,10 @@ def run(config: DictConfig, output: Path) -> None:
     with torch.no_grad():
         identity = stored_identity(layer, stored)
         shown = _shown_frames(motion.frame_count, options.picture.frames)
-        result = animate(layer, identity, motion, translation=str(options.translation), keep=shown)
+        result = animate(
+            layer, identity, motion, translation=options.translation, ground=options.ground,
+            contacts=options.contacts, keep=shown,
+        )  # fmt: skip
     motion = replace(result.motion, identity=stored)
     _write(options, output, layer, identity, replace(result, motion=motion))
 
