@@ -18,17 +18,17 @@ __all__ = ["lock_feet"]
 _EASE_SECONDS = 0.2
 """How long a foot takes from its own path to a pinned one, and back."""
 
-_STRETCH = 0.998
+_STRETCH = 0.995
 """Part of its length that a leg is stretched to at most, where the motion did not stretch it further."""
 
 _DEEPEST = 0.05
 """How far the Hips may sink so that legs reach, in heights of the body; then a foot is let slide."""
 
-_STRAIGHT = 0.02
-"""A knee less far out of the leg's line than this part of it takes its side from where the thigh looks."""
+_STRAIGHT = 0.05
+"""A knee that lies less far out of the leg's line than this part of the thigh counts as nearly straight."""
 
-_ROUNDS = 3
-"""Times a leg is bent: exact at the first for a bent knee; a straight one needs the side it bends to."""
+_UNBENT = np.radians(15)
+"""Further bend [rad] over which a knee that was bent the wrong way comes round."""
 
 
 def lock_feet(
@@ -150,37 +150,41 @@ class _Leg:
         self.hip, self.knee, self.ankle = self.hip - sunk, self.knee - sunk, self.ankle - sunk
 
     def reach(self, ankle: np.ndarray, turn: np.ndarray) -> None:
-        """Bend the leg until its ankle is there, or stretched towards it; turn the foot in the world."""
-        for _ in range(_ROUNDS):
-            self._bend(ankle)
-        self.turned[2] = turn @ self.turned[2]
+        """Bend the knee, then turn the leg about the hip until the ankle is there; turn the foot in the world.
 
-    def _bend(self, ankle: np.ndarray) -> None:
-        """Turn thigh and shin in the plane of the leg, then the plane about the hip."""
+        A knee that the motion bends the wrong way is bent back step by step with what is asked of it, so
+        that it does not flip; the ankle then misses by less than a thousandth of the leg.
+        """
         line, far = _unit(self.ankle - self.hip)
         way, wanted = _unit(ankle - self.hip)
-        wanted = np.clip(wanted, np.abs(self.thigh - self.shin) + 1e-6, self.longest)
-        axis = self._hinge(line)
-        at_hip = _angle(self.thigh, wanted, self.shin) - _angle(self.thigh, far, self.shin)
-        at_ankle = _angle(self.shin, wanted, self.thigh) - _angle(self.shin, far, self.thigh)
-        plane = _shortest_arc(line, way)
-        thigh = plane @ Rotation.from_rotvec(at_hip[:, None] * axis).as_matrix()
-        shin = plane @ Rotation.from_rotvec(-at_ankle[:, None] * axis).as_matrix()
-        knee = self.hip + (thigh @ (self.knee - self.hip)[..., None])[..., 0]
-        self.ankle = knee + (shin @ (self.ankle - self.knee)[..., None])[..., 0]
-        self.knee = knee
-        self.turned[:2] = [thigh @ self.turned[0], shin @ self.turned[1]]
+        axis, side = self._hinge(line)
+        own = side * self._bend(far)
+        longest = np.where(side < 0, far, self.longest)
+        bend = self._bend(np.clip(wanted, np.abs(self.thigh - self.shin), longest))
+        more = np.clip((bend - np.abs(own)) / _UNBENT, 0, 1)
+        bend -= (np.abs(own) - own) * (1 - more) ** 2 * (1 + 2 * more)
+        shin = Rotation.from_rotvec((own - bend)[:, None] * axis).as_matrix()
+        bent = self.knee + (shin @ (self.ankle - self.knee)[..., None])[..., 0]
+        about_hip = _shortest_arc(bent - self.hip, way)
+        self.turned = [about_hip @ self.turned[0], about_hip @ shin @ self.turned[1], turn @ self.turned[2]]
 
-    def _hinge(self, line: np.ndarray) -> np.ndarray:
-        """Axis (frames, 3) that turns the leg's line towards its knee."""
-        out = self.knee - self.hip
-        out = out - (out * line).sum(axis=1, keepdims=True) * line
+    def _bend(self, far: np.ndarray) -> np.ndarray:
+        """Angle [rad] of the knee, zero for a straight leg, whose ends lie so far apart."""
+        cosine = (far**2 - self.thigh**2 - self.shin**2) / np.maximum(2 * self.thigh * self.shin, 1e-12)
+        return np.arccos(np.clip(cosine, -1, 1))
+
+    def _hinge(self, line: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Axis (frames, 3) that a knee bends about, and 1 where it does, -1 where it is bent the wrong way.
+
+        A knee that is nearly straight tells no axis; there it is the one that the thigh has in the T-pose.
+        """
         rest = self.rig.t_pose_world[self.joints[0], :3, :3]
-        ahead = (self.turned[0] @ rest.T)[..., 2]  # the body looks along +z in the T-pose
-        ahead = ahead - (ahead * line).sum(axis=1, keepdims=True) * line
-        bent, straight = np.linalg.norm(out, axis=1), _STRAIGHT * self.thigh
-        missing = np.clip(1 - bent / straight, 0, 1) * straight
-        return _unit(np.cross(line, out + missing[:, None] * ahead))[0]
+        across = -(self.turned[0] @ rest.T)[..., 0]  # in the T-pose +x is the body's left
+        across = _unit(across - (across * line).sum(axis=1, keepdims=True) * line)[0]
+        plane = np.cross(line, self.knee - self.hip)
+        side = np.where((plane * across).sum(axis=1) < 0, -1.0, 1.0)
+        missing = np.clip(_STRAIGHT * self.thigh - np.linalg.norm(plane, axis=1), 0, None)
+        return _unit(side[:, None] * plane + missing[:, None] * across)[0], side
 
     def store(self, rotations: np.ndarray, *, absolute: bool) -> None:
         """Write the local rotations of the leg into those of a motion (frames, 77, 3, 3)."""
@@ -199,12 +203,6 @@ def _smooth_drop(needed: np.ndarray, fps: float, deepest: float) -> np.ndarray:
     reach = max(round(_EASE_SECONDS * fps), 1)
     held = maximum_filter1d(np.minimum(needed, deepest), 2 * reach + 1, mode="nearest")
     return gaussian_filter1d(held, reach / 2, mode="nearest", truncate=2.0)
-
-
-def _angle(beside: np.ndarray, far: np.ndarray, across: np.ndarray) -> np.ndarray:
-    """Angle [rad] between two sides of a triangle of which the third is `across`."""
-    cosine = (beside**2 + far**2 - across**2) / np.maximum(2 * beside * far, 1e-12)
-    return np.arccos(np.clip(cosine, -1, 1))
 
 
 def _unit(vectors: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
