@@ -166,9 +166,7 @@ def _contacts(sample: _Sample, frames: int) -> np.ndarray | None:
         return None
 
 
-def _skeleton(
-    sample: _Sample, local: np.ndarray, names: tuple[str, ...], metres: float
-) -> np.ndarray | None:
+def _skeleton(sample: _Sample, local: np.ndarray, names: tuple[str, ...], metres: float) -> np.ndarray | None:
     """Offset of each joint from its parent in the T-pose (77, 3) [m], from where the joints are.
 
     A joint whose parent the file does not hold has NaN.

@@ -23,6 +23,7 @@ from soma_core.motion.ground import (
     leg_length,
     planted_path,
     rest_offsets,
+    skeleton_of,
     standing,
 )
 from soma_core.options import Contacts, FrameRange, Ground, Translation
@@ -50,12 +51,16 @@ class Animated:
         transforms: (frames, J, 4, 4) float32 world transforms [m].
         helpers: (frames, H, 4, 4) float32 world transforms of the twist joints [m]; H = 0 without them.
         vertices: frame -> posed vertices (v, 3) [m], for the frames asked for.
+        feet: where they are in every frame; None for a rig without feet.
+        contacts: (frames, 4) which of them stand, as the file says or as was found; None as `feet`.
     """
 
     motion: Motion
     transforms: np.ndarray
     helpers: np.ndarray
     vertices: Mapping[int, np.ndarray]
+    feet: FootTrack | None = None
+    contacts: np.ndarray | None = None
 
 
 def load_clip(
@@ -125,15 +130,15 @@ def animate(
             expected=f"frames from 0 to {motion.frame_count - 1}",
             fix="Correct the numbers.",
         )
-    offsets = rest_offsets(layer.rig, identity.bind_world[0].detach().cpu().double().numpy())
+    offsets = skeleton_of(layer.rig, identity)
     path = _hips_path(layer, identity, motion, translation, offsets)
     motion = replace(motion, translation=path)
     played = _played(layer, identity, motion, wanted)
     shift, floor = _standing(played, motion, translation, ground)
     played = played.moved(shift)
     motion = replace(motion, translation=motion.translation + shift.astype(np.float32))
-    if contacts == "lock" and played.track is not None:
-        held = contacts_of(played.track, motion, floor)
+    held = None if played.track is None else contacts_of(played.track, motion, floor)
+    if contacts == "lock" and held is not None:
         motion = lock_feet(motion, played.transforms, played.track, held, rig=layer.rig, floor=floor)
         played = _played(layer, identity, motion, wanted)
     return Animated(
@@ -141,6 +146,8 @@ def animate(
         transforms=played.transforms,
         helpers=played.helpers,
         vertices={frame: played.vertices[frame] for frame in sorted(played.vertices)},
+        feet=played.track,
+        contacts=held,
     )
 
 
@@ -171,7 +178,7 @@ class _Played:
 
 def _played(layer: SomaLayer, identity: Identity, motion: Motion, wanted: set[int]) -> _Played:
     """Pose every frame; keep the vertices of those that are wanted."""
-    soles = Soles(layer.mesh, layer.rig)
+    soles = Soles(layer.rig)
     transforms, helpers, vertices, lowest, heights = [], [], {}, [], []
     for start, posed in _posed_chunks(layer, identity, motion, motion.translation):
         transforms.append(posed.transforms.cpu().numpy())
@@ -201,8 +208,10 @@ def _ground_choice(translation: str, ground: str | None, contacts: str) -> str:
         InputError: no such choice, or one that does not go with the translation.
     """
     for name, value, choices in (
-        ("translation", translation, Translation), ("ground", ground, Ground), ("contacts", contacts, Contacts)
-    ):  # fmt: skip
+        ("translation", translation, Translation),
+        ("ground", ground, Ground),
+        ("contacts", contacts, Contacts),
+    ):
         if value is not None and value not in list(choices):
             expected = " or ".join(map(repr, map(str, choices)))
             raise InputError(name, got=repr(value), expected=expected, fix="Choose where the body stands.")

@@ -84,18 +84,18 @@ class BackConverter:
             )
         motion = read(path, fps=self._options.fps, unit=self._options.unit)
         layer, stored = self._body(path, motion)
-        target = self._target(stored)
+        target, placing = self._target(stored), _placing(self._options)
         settings = {
             "input": str(path.resolve()), "layout": layout, "fps": motion.fps, "body": stored["backend"],
-            "body_params": stored.get("params"), "translation": str(self._options.translation),
-            **model_settings(layer), **target.facts, "content": fingerprint(path),
+            "body_params": stored.get("params"), **placing, **model_settings(layer), **target.facts,
+            "content": fingerprint(path),
         }  # fmt: skip
         vertices = isinstance(target, VertexTarget)
         earlier = earlier_report(files.report, files.vertices if vertices else files.motion, settings)
         if earlier is not None:
             return Converted(report=earlier, files=files, earlier=True, vertices=vertices)
         kept = FittedChunks(chunks, settings, frame_count=motion.frame_count, size=self._options.chunk)
-        body = _placed(layer, stored_identity(layer, stored), motion, str(self._options.translation))
+        body = _placed(layer, stored_identity(layer, stored), motion, placing)
         if isinstance(target, SmplTarget) and target.params is None:
             target = replace(target, params=_found_params(kept.folder / "params.json", target, body))
             settings["found"] = target.params
@@ -150,12 +150,19 @@ class BackConverter:
         )
 
 
-def _placed(layer: SomaLayer, identity: Identity, motion: Motion, translation: str) -> _MovingBody:
+def _placing(options: ConvertOptions) -> dict[str, str]:
+    """Where the body is to stand, as far as it is not the usual."""
+    chosen = {"translation": options.translation, "ground": options.ground, "contacts": options.contacts}
+    usual = {"ground": None, "contacts": "free"}
+    return {name: str(value) for name, value in chosen.items() if value != usual.get(name, "")}
+
+
+def _placed(layer: SomaLayer, identity: Identity, motion: Motion, placing: Mapping[str, str]) -> _MovingBody:
     """The body where it is to stand."""
     if not check_rig(motion, layer.rig.revision):
         _log.info("the motion was made for rig %s; its relative rotations carry over", motion.rig_revision)
-    if translation != "motion":
-        motion = animate(layer, identity, motion, translation=translation).motion
+    if placing != {"translation": "motion"}:
+        motion = animate(layer, identity, motion, **placing).motion
     return _MovingBody(layer=layer, identity=identity, motion=motion)
 
 

@@ -43,7 +43,7 @@ def lock_feet(
     """Pin heels and toes in contact, by the hips, knees and ankles of the legs.
 
     Each contact is held where it is on average, its sole on the floor if it is near. Feet between contacts
-    keep their own path, and thighs the side that the knee bends to. Where a leg does not reach, the Hips sink.
+    keep their own path, and knees the side that they bend to. Where a leg does not reach, the Hips sink.
 
     Args:
         motion: rotations and path of the Hips [m] of the body that was posed.
@@ -54,7 +54,9 @@ def lock_feet(
         floor: height of the floor [m].
     """
     pins = [
-        _pin(track.joints[:, index], track.soles[:, index], contacts[:, index], motion.fps, track.height, floor)
+        _pin(
+            track.joints[:, index], track.soles[:, index], contacts[:, index], motion.fps, track.height, floor
+        )
         for index in range(len(CONTACT_JOINTS))
     ]
     goals = [_foot_goal(track.joints[:, 2 * side :], *pins[2 * side : 2 * side + 2]) for side in (0, 1)]
@@ -150,7 +152,7 @@ class _Leg:
         self.hip, self.knee, self.ankle = self.hip - sunk, self.knee - sunk, self.ankle - sunk
 
     def reach(self, ankle: np.ndarray, turn: np.ndarray) -> None:
-        """Bend the knee, then turn the leg about the hip until the ankle is there; turn the foot in the world.
+        """Bend the knee, turn the leg about the hip until the ankle is there, and turn the foot in the world.
 
         A knee that the motion bends the wrong way is bent back step by step with what is asked of it, so
         that it does not flip; the ankle then misses by less than a thousandth of the leg.

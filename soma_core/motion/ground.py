@@ -11,10 +11,20 @@ from torch import Tensor
 
 from soma_core.io.joint_order import CONTACT_JOINTS, USER_JOINTS
 from soma_core.io.motion import Motion
-from soma_core.rig.mesh import CanonicalMesh
 from soma_core.rig.skeleton import Rig
+from soma_core.skeleton.identity import Identity
 
-__all__ = ["FootTrack", "Soles", "contacts_of", "floor_height", "leg_length", "planted_path", "rest_offsets", "standing"]
+__all__ = [
+    "FootTrack",
+    "Soles",
+    "contacts_of",
+    "floor_height",
+    "leg_length",
+    "planted_path",
+    "rest_offsets",
+    "skeleton_of",
+    "standing",
+]
 
 SLOW = 0.2
 """A foot that is slower than this stands, in heights of the body a second: 0.35 m/s for an adult."""
@@ -73,10 +83,10 @@ class Soles:
     """The skin under heels and toes.
 
     Args:
-        mesh, rig: the canonical ones. A rig without feet has none, and nothing stands on them.
+        rig: the canonical one. A rig without feet has none, and nothing stands on them.
     """
 
-    def __init__(self, mesh: CanonicalMesh, rig: Rig) -> None:
+    def __init__(self, rig: Rig) -> None:
         names = rig.joint_names
         self.joints = [names.index(name) for name in CONTACT_JOINTS if name in names]
         self._parts = [_ends(rig, side) for side in ("Left", "Right")] if len(self.joints) == 4 else []
@@ -113,12 +123,17 @@ def leg_length(offsets: np.ndarray | None) -> float | None:
     return length if np.isfinite(length) and length > 0 else None
 
 
+def skeleton_of(rig: Rig, identity: Identity) -> np.ndarray:
+    """Offset of each user joint from its parent in the T-pose (77, 3) [m], of one identity."""
+    return rest_offsets(rig, identity.bind_world[0].detach().cpu().double().numpy())
+
+
 def rest_offsets(rig: Rig, bind_world: np.ndarray) -> np.ndarray:
-    """Offset of each user joint from its parent in the T-pose (J - 1, 3) [m]; zero for the Hips.
+    """Offset of each user joint from its parent in the T-pose (77, 3) [m]; zero for the Hips.
 
     Args:
         rig: whose T-pose.
-        bind_world: (J, 4, 4) transforms of the joints of an identity [m], in any pose.
+        bind_world: (78, 4, 4) transforms of the joints of a body [m], in any pose.
     """
     joints, parents = np.arange(2, rig.joint_count), rig.parents[2:]
     turned = rig.t_pose_world[parents, :3, :3] @ np.swapaxes(bind_world[parents, :3, :3], -1, -2)

@@ -8,8 +8,10 @@ from soma_core.errors import InputError
 from soma_core.options import (
     BackendChoice,
     BodyGender,
+    Contacts,
     ConvertResult,
     FitLod,
+    Ground,
     IdentityChoice,
     InversionChoice,
     LengthUnit,
@@ -90,6 +92,8 @@ class ConvertOptions(FitOptions):
         most_betas: how many of a file's shape coefficients are used; None: all.
         betas: shape coefficients of the model, on the way back; None: the body's own, or the nearest.
         translation: where the body stands, on the way back.
+        ground: what lies on the floor then; None: the usual for that translation.
+        contacts: whether feet that stand are pinned, on the way back.
     """
 
     to: str = "soma"
@@ -98,6 +102,8 @@ class ConvertOptions(FitOptions):
     most_betas: int | None = None
     betas: list[float] | None = None
     translation: Translation = Translation.motion
+    ground: Ground | None = None
+    contacts: Contacts = Contacts.free
 
     def __post_init__(self) -> None:
         """Refuse settings of the other direction, which would change nothing."""
@@ -107,7 +113,9 @@ class ConvertOptions(FitOptions):
         why = f"to={self.to}"
         if self.to == "soma":
             placed = None if self.translation == "motion" else str(self.translation)
-            unused = {"betas": self.betas, "result": self.result, "translation": placed}
+            held = None if self.contacts == "free" else str(self.contacts)
+            unused = {"betas": self.betas, "result": self.result, "translation": placed,
+                      "ground": self.ground, "contacts": held}  # fmt: skip
             if self.backend is not None and sought is None and self.backend.name != "mhr":
                 unused["backend"] = self.backend.name  # a file tells its own model
             why = "to=soma" if sought else "to=soma and identity=known"
