@@ -29,6 +29,9 @@ _NATIVE = "native"
 _MOST_SLIDE = 1.1
 """Slide over that of the body that was recorded, scaled by the legs."""
 
+_STILL_MM = 3.0
+"""A slide below this [mm/s], a tenth of a millimetre a frame, is none: its ratio is held to no bound."""
+
 _MOST_HOVER_MM = 8.0
 """Median distance of soles that stand from the floor."""
 
@@ -115,9 +118,10 @@ def _bodies(backend: str, native: SomaLayer, device: str) -> Iterator[tuple[str,
     yield _NATIVE, native, native.identity({})
 
 
-def _figures(label: str, slide: float, hover: float) -> list[Figure]:
+def _figures(label: str, slide: float, own: float, hover: float) -> list[Figure]:
+    most = _MOST_SLIDE if slide > _STILL_MM else None
     return [
-        Figure(name=f"slide over the file's own, {label}", value=slide, bound=_MOST_SLIDE),
+        Figure(name=f"slide over the file's own, {label}", value=slide / max(own, 1e-9), bound=most),
         Figure(name=f"median hover, {label}", value=hover, unit="mm", bound=_MOST_HOVER_MM),
     ]
 
@@ -138,7 +142,7 @@ def run(config: DictConfig) -> Report:
             slide, own, hover = _measured(layer, identity, clip, "free")
             locked, _, _ = _measured(layer, identity, clip, "lock")
             rows.append([f"{clip.name}, {name}", own, slide, locked, hover])
-            figures += _figures(f"{clip.name}, {name}", slide / max(own, 1e-9), hover)
+            figures += _figures(f"{clip.name}, {name}", slide, own, hover)
     columns = (
         "motion, body", "the file's own slide at this size, mm/s", "slide, mm/s",
         "slide with contacts=lock, mm/s", "median hover, mm",

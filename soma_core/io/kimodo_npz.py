@@ -49,7 +49,7 @@ _SPREAD = {
 
 
 def read_kimodo_npz(
-    fields: NpzFields, *, fps: float | None, unit: str | None = None, person: int | None = None
+    fields: NpzFields, *, fps: float | None, unit: str | None = None, person: str | None = None
 ) -> Motion:
     """Read a kimodo motion (metres, +Y up, +Z forward; rotations relative to the T-pose).
 
@@ -94,7 +94,7 @@ def read_kimodo_npz(
 class _Sample:
     """One sample of a file, whose arrays may have a leading axis of samples."""
 
-    def __init__(self, fields: NpzFields, person: int | None) -> None:
+    def __init__(self, fields: NpzFields, person: str | None) -> None:
         self.fields, self._person = fields, person
 
     def __contains__(self, key: str) -> bool:
@@ -103,23 +103,22 @@ class _Sample:
     def numbers(self, key: str, shape: tuple[int | str, ...]) -> np.ndarray:
         """Finite numbers of the sample under `key`, checked as :meth:`NpzFields.numbers` does."""
         if self.fields.raw(key).ndim <= len(shape):
-            _refuse_person(self.fields, key, 1, self._person)
+            _chosen(self.fields, key, 1, self._person)
             return self.fields.numbers(key, shape)
         values = self.fields.numbers(key, ("samples", *shape))
-        _refuse_person(self.fields, key, len(values), self._person)
-        return values[self._person or 0]
+        return values[_chosen(self.fields, key, len(values), self._person)]
 
 
-def _refuse_person(fields: NpzFields, key: str, count: int, person: int | None) -> None:
-    """Refuse a sample that is not there, and none where there are several."""
-    if (person is None and count == 1) or (person is not None and 0 <= person < count):
-        return
-    known = "0" if count == 1 else f"0 to {count - 1}"
+def _chosen(fields: NpzFields, key: str, count: int, person: str | None) -> int:
+    """Number of the sample that is asked for; refuses one that is not there, and to choose among several."""
+    known = [str(number) for number in range(count)]
+    if person in known or (person is None and count == 1):
+        return int(person or 0)
     raise fields.refuse(
         key,
         got=f"{count} samples" if person is None else f"person={person} of {count} samples",
-        expected=f"a choice from {known}" if count else "at least one",
-        fix="Pass person=0 (or another number)." if count else "Generate it again.",
+        expected=f"one of 0 to {count - 1}" if count > 1 else "person=0" if count else "at least one",
+        fix="Pass person=0, or another of these numbers." if count else "Generate it again.",
     )
 
 
@@ -155,15 +154,21 @@ def _hips(sample: _Sample, frames: int, count: int) -> np.ndarray:
     return sample.numbers("posed_joints", (frames, count, 3))[:, 0]
 
 
-def _contacts(sample: _Sample, frames: int) -> np.ndarray | None:
-    """Heels and toes on the ground, (frames, 4) bool."""
-    if "foot_contacts" not in sample:
+def _extra(sample: _Sample, key: str, shape: tuple[int | str, ...]) -> np.ndarray | None:
+    """Numbers that a motion can do without: where they are not as they should be, that is said."""
+    if key not in sample:
         return None
     try:
-        return sample.numbers("foot_contacts", (frames, len(CONTACT_JOINTS))) > LIKELY_CONTACT
+        return sample.numbers(key, shape)
     except InputError as error:
-        _log.warning("foot contacts are not used: %s", error)
+        _log.warning("%s is not used: %s", key, error)
         return None
+
+
+def _contacts(sample: _Sample, frames: int) -> np.ndarray | None:
+    """Heels and toes on the ground, (frames, 4) bool."""
+    likely = _extra(sample, "foot_contacts", (frames, len(CONTACT_JOINTS)))
+    return None if likely is None else likely > LIKELY_CONTACT
 
 
 def _skeleton(sample: _Sample, local: np.ndarray, names: tuple[str, ...], metres: float) -> np.ndarray | None:
@@ -171,9 +176,9 @@ def _skeleton(sample: _Sample, local: np.ndarray, names: tuple[str, ...], metres
 
     A joint whose parent the file does not hold has NaN.
     """
-    if "posed_joints" not in sample:
+    joints = _extra(sample, "posed_joints", (len(local), len(names), 3))
+    if joints is None:
         return None
-    joints = sample.numbers("posed_joints", (len(local), len(names), 3))
     few = np.unique(np.linspace(0, len(local) - 1, _MEASURED).astype(int))
     joints, world = joints[few], local[few]
     offsets = np.full((len(USER_JOINTS), 3), np.nan)

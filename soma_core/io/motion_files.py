@@ -32,7 +32,7 @@ def read_motion(
     fps: float | None = None,
     unit: str | None = None,
     convention: Convention | None = None,
-    person: int | None = None,
+    person: str | None = None,
 ) -> Motion:
     """Read a motion from an NPZ file: our schema, the SOMA tools' files, or kimodo's.
 

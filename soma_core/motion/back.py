@@ -82,7 +82,7 @@ class BackConverter:
                 expected="a motion on this skeleton, for the way back",
                 fix="Convert it with to=soma first.",
             )
-        motion = read(path, fps=self._options.fps, unit=self._options.unit)
+        motion = read(path, fps=self._options.fps, unit=self._options.unit, person=self._options.person)
         layer, stored = self._body(path, motion)
         target, placing = self._target(stored), _placing(self._options)
         settings = {

@@ -81,13 +81,20 @@ def layout_of(path: str | Path) -> Layout | None:
         return "soma" if "schema_version" in fields or {"poses", "transl"} <= {*fields.names} else None
 
 
-def read(path: str | Path, *, fps: float | None = None, unit: LengthUnit | str | None = None) -> Motion:
+def read(
+    path: str | Path,
+    *,
+    fps: float | None = None,
+    unit: LengthUnit | str | None = None,
+    person: str | None = None,
+) -> Motion:
     """Read a motion on this skeleton: a file of this project, of the SOMA tools or of kimodo.
 
     Args:
         path: the file. What other skeletons move in is for :func:`convert`.
         fps: frame rate, where the file has none.
         unit: ``m``, ``cm`` or ``mm``; overrides the file's own.
+        person: which sample of a kimodo file of several, ``0`` for the first.
 
     Raises:
         AssetError: the file is missing, damaged, a git-LFS pointer or no NPZ.
@@ -99,7 +106,7 @@ def read(path: str | Path, *, fps: float | None = None, unit: LengthUnit | str |
         )
     metres = METRES[str(unit)] if unit else None
     name = next((name for name, length in METRES_PER_UNIT.items() if length == metres), None)
-    return read_motion(path, fps=fps, unit=name)
+    return read_motion(path, fps=fps, unit=name, person=person)
 
 
 def write(motion: Motion, path: str | Path) -> None:

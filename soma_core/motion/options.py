@@ -91,6 +91,7 @@ class ConvertOptions(FitOptions):
         gender: of SMPL models; None: that of the file.
         most_betas: how many of a file's shape coefficients are used; None: all.
         betas: shape coefficients of the model, on the way back; None: the body's own, or the nearest.
+        person: whose motion, in a file of several people.
         translation: where the body stands, on the way back.
         ground: what lies on the floor then; None: the usual for that translation.
         contacts: whether feet that stand are pinned, on the way back.
@@ -101,6 +102,7 @@ class ConvertOptions(FitOptions):
     gender: BodyGender | None = None
     most_betas: int | None = None
     betas: list[float] | None = None
+    person: str | None = None
     translation: Translation = Translation.motion
     ground: Ground | None = None
     contacts: Contacts = Contacts.free
