@@ -44,9 +44,9 @@ def test_a_short_clip_on_the_native_body(tmp_path, monkeypatch):
     report = ground_contact.run(config(str(tmp_path)))
     assert not report.failed
     assert [row[0] for row in report.tables[0].rows] == ["short, native"]
-    monkeypatch.setenv("SOMA_TEST_DATA", str(tmp_path / "none"))
+    empty = tmp_path / "none"
+    empty.mkdir()
+    monkeypatch.setenv("SOMA_TEST_DATA", str(empty))
     assert ground_contact._files(None) == []
     with pytest.raises(AssetError, match="no motion files"):
-        ground_contact.run(
-            config(str(tmp_path / "none")) if (tmp_path / "none").mkdir() else config(str(tmp_path / "none"))
-        )
+        ground_contact.run(config(str(empty)))
