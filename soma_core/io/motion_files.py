@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from soma_core.cache import atomic_arrays
 from soma_core.errors import InputError
+from soma_core.io.gem_x import gem_x_motion, gem_x_parts
 from soma_core.io.joint_order import USER_JOINTS
 from soma_core.io.kimodo_npz import read_kimodo_npz
 from soma_core.io.motion import Convention, Motion
@@ -34,14 +35,14 @@ def read_motion(
     convention: Convention | None = None,
     person: str | None = None,
 ) -> Motion:
-    """Read a motion from an NPZ file: our schema, the SOMA tools' files, or kimodo's.
+    """Read a motion from an NPZ file: our schema, the SOMA tools' files, kimodo's or GEM-X's.
 
     Args:
         path: the file. Nothing in it is executed; keys that are not needed are ignored.
-        fps: frame rate; needed where the file has none (SOMA tools). kimodo files count as 30.
+        fps: frame rate; needed where the file has none (SOMA tools, GEM-X). kimodo files count as 30.
         unit: ``meters``, ``centimeters`` or ``millimeters``; overrides the file's own.
         convention: what zero means; overrides the file's own.
-        person: which sample of a kimodo file that holds several, from 0.
+        person: which of the samples of kimodo or the people of GEM-X, from ``0``.
 
     Returns:
         The motion in metres, +Y up, 77 joints with Hips first.
@@ -55,10 +56,13 @@ def read_motion(
             return read_kimodo_npz(fields, fps=fps, unit=unit, person=person)
         if "schema_version" in fields or ("poses" in fields and "transl" in fields):
             return read_soma_npz(fields, fps=fps, unit=unit, convention=convention)
+        parts = gem_x_parts(fields)
+        if parts is not None:
+            return gem_x_motion(parts, path=fields.path, fps=fps, person=person)
         raise fields.refuse(
             "layout",
             got=f"the keys {', '.join(fields.names) or '(none)'}",
-            expected="'poses' and 'transl' (SOMA), or 'global_rot_mats' (kimodo)",
+            expected="'poses' and 'transl' (SOMA), 'global_rot_mats' (kimodo), or 'body_pose' (GEM-X)",
             fix="Convert the motion to the SOMA skeleton first.",
         )
 

@@ -9,6 +9,7 @@ from typing import Literal
 
 from soma_core.errors import InputError
 from soma_core.io.amass import holds_smpl_motion
+from soma_core.io.gem_x import gem_x_parts
 from soma_core.io.motion import Motion
 from soma_core.io.motion_files import read_motion, write_motion
 from soma_core.io.npz_fields import open_npz
@@ -76,6 +77,8 @@ def layout_of(path: str | Path) -> Layout | None:
             return "kimodo"
         if "pred_vertices" in fields:
             return "sam3d"
+        if gem_x_parts(fields) is not None:
+            return "soma"
         if holds_smpl_motion(fields):
             return "amass"
         return "soma" if "schema_version" in fields or {"poses", "transl"} <= {*fields.names} else None
@@ -94,7 +97,7 @@ def read(
         path: the file. What other skeletons move in is for :func:`convert`.
         fps: frame rate, where the file has none.
         unit: ``m``, ``cm`` or ``mm``; overrides the file's own.
-        person: which sample of a kimodo file of several, ``0`` for the first.
+        person: which of the samples of kimodo or the people of GEM-X, from ``0``.
 
     Raises:
         AssetError: the file is missing, damaged, a git-LFS pointer or no NPZ.

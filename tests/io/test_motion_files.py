@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 from soma_core.errors import AssetError, InputError
 from soma_core.io import USER_JOINTS, Motion, check_rig, read_motion, write_motion, write_motion_parts
 from soma_core.io.joint_order import KIMODO_30_JOINTS, PARENT_NAMES, nearest_ancestors
+from soma_core.motion import layout_of
 
 ROTVEC_TOLERANCE = 2e-6
 """Matrix entries after a trip through float32 rotation vectors of up to 3 rad."""
@@ -441,6 +442,56 @@ def test_recorded_kimodo_motions(path, tmp_path):
     assert 0.3 < motion.translation[:, 1].min() < motion.translation[:, 1].max() < 1.6  # one of them jumps
     write_motion(motion, tmp_path / "m.npz")
     np.testing.assert_array_equal(read_motion(tmp_path / "m.npz").rotations, motion.rotations)
+
+
+# -- GEM-X --------------------------------------------------------------------------------------------
+
+
+def gem_x_arrays(people=1):
+    """Parameters as ``body_params_global`` of GEM-X holds them, and the rotations that they are of."""
+    turns = random_rotations(people * 4, 77, seed=6)
+    vectors = Rotation.from_matrix(turns.reshape(-1, 3, 3)).as_rotvec().reshape(people, 4, 231)
+    random = np.random.default_rng(7)
+    arrays = {
+        "global_orient": vectors[..., :3], "body_pose": vectors[..., 3:],
+        "transl": random.normal(size=(people, 4, 3)), "identity_coeffs": random.normal(size=(people, 4, 45)),
+        "scale_params": random.normal(size=(people, 4, 69)),
+    }  # fmt: skip
+    return arrays, turns.reshape(people, 4, 77, 3, 3)
+
+
+@pytest.mark.parametrize("layout", ["one", "batch of one", "joints", "matrices"])
+def test_gem_x_parameters_are_a_motion_of_this_skeleton(tmp_path, layout):
+    arrays, turns = gem_x_arrays()
+    if layout != "batch of one":
+        arrays = {key: value[0] for key, value in arrays.items()}
+    if layout == "joints":
+        arrays["body_pose"] = arrays["body_pose"].reshape(4, 76, 3)
+    if layout == "matrices":
+        arrays |= {"global_orient": turns[0, :, 0], "body_pose": turns[0, :, 1:]}
+    path = save(tmp_path / "g.npz", **arrays)
+    assert layout_of(path) == "soma"
+    motion = read_motion(path, fps=24)
+    np.testing.assert_allclose(motion.rotations, turns[0], atol=KIMODO_TOLERANCE)
+    np.testing.assert_allclose(motion.translation, arrays["transl"].reshape(4, 3), atol=1e-6)
+    assert motion.identity["backend"] == "mhr"
+    means = arrays["identity_coeffs"].reshape(4, 45).mean(axis=0, keepdims=True)
+    np.testing.assert_allclose(motion.identity["identity_coeffs"], means, atol=1e-6)
+    with pytest.raises(InputError, match=r"fps: got no frame rate.*Pass fps=30"):
+        read_motion(path)
+
+
+def test_one_of_the_people_of_gem_x(tmp_path):
+    arrays, turns = gem_x_arrays(people=2)
+    path = save(tmp_path / "g.npz", **arrays)
+    np.testing.assert_allclose(
+        read_motion(path, fps=30, person="1").rotations, turns[1], atol=KIMODO_TOLERANCE
+    )
+    with pytest.raises(InputError, match=r"person: got none of 2 people, expected one of 0, 1"):
+        read_motion(path, fps=30)
+    arrays["body_pose"][1, 2, 5] = np.nan
+    with pytest.raises(InputError, match=r"body_pose: got shape \(2, 4, 228\)"):
+        read_motion(save(tmp_path / "g.npz", **arrays), fps=30, person="1")
 
 
 # -- joints, motions, rigs ----------------------------------------------------------------------------
