@@ -135,7 +135,7 @@ def animate(
     motion = replace(motion, translation=path)
     played = _played(layer, identity, motion, wanted)
     shift, floor = _standing(played, motion, translation, ground)
-    played = played.moved(shift)
+    played.move(shift)
     motion = replace(motion, translation=motion.translation + shift.astype(np.float32))
     held = None if played.track is None else contacts_of(played.track, motion, floor)
     if contacts == "lock" and held is not None:
@@ -151,29 +151,24 @@ def animate(
     )
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@dataclass(kw_only=True, eq=False)
 class _Played:
     """A motion as it was posed; `track` is None for a rig without feet."""
 
     transforms: np.ndarray
     helpers: np.ndarray
-    vertices: Mapping[int, np.ndarray]
+    vertices: dict[int, np.ndarray]
     lowest: np.ndarray
     track: FootTrack | None
 
-    def moved(self, shift: np.ndarray) -> _Played:
-        """The same bodies elsewhere, by (frames, 3) [m]."""
+    def move(self, shift: np.ndarray) -> None:
+        """Put every body elsewhere, by (frames, 3) [m]."""
         step = shift.astype(np.float32)
-        transforms, helpers = self.transforms.copy(), self.helpers.copy()
-        transforms[:, 1:, :3, 3] += step[:, None]  # Root, which is virtual, stays at the origin
-        helpers[..., :3, 3] += step[:, None]
-        return _Played(
-            transforms=transforms,
-            helpers=helpers,
-            vertices={frame: vertices + step[frame] for frame, vertices in self.vertices.items()},
-            lowest=self.lowest + shift[:, 1],
-            track=self.track.moved(shift) if self.track else None,
-        )
+        self.transforms[:, 1:, :3, 3] += step[:, None]  # Root, which is virtual, stays at the origin
+        self.helpers[..., :3, 3] += step[:, None]
+        self.vertices = {frame: vertices + step[frame] for frame, vertices in self.vertices.items()}
+        self.lowest = self.lowest + shift[:, 1]
+        self.track = self.track.moved(shift) if self.track else None
 
 
 def _played(layer: SomaLayer, identity: Identity, motion: Motion, wanted: set[int]) -> _Played:

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.sparse
 import scipy.sparse.linalg
+from scipy.ndimage import maximum_filter1d, minimum_filter1d
 from torch import Tensor
 
 from soma_core.io.joint_order import CONTACT_JOINTS, USER_JOINTS
@@ -28,6 +29,12 @@ __all__ = [
 
 SLOW = 0.2
 """A foot that is slower than this stands, in heights of the body a second: 0.35 m/s for an adult."""
+
+_SLIDING = 2.0
+"""A foot that is faster than this many times what is slow does not stand, whatever a file says."""
+
+_STEADY_SECONDS = 0.1
+"""Shorter contacts, and shorter gaps in one, are none, where they are found."""
 
 LOW = 0.03
 """A sole that is no higher above the floor than this touches it, in heights of the body: 5 cm."""
@@ -176,17 +183,21 @@ def standing(track: FootTrack, motion: Motion) -> tuple[np.ndarray, float]:
 
 
 def contacts_of(track: FootTrack, motion: Motion, floor: float) -> np.ndarray:
-    """Which heels and toes stand (frames, 4): as the file says, else the low and slow ones.
+    """Which heels and toes stand (frames, 4): as the file says where they do not run, else the low and slow.
 
     Args:
         track: the feet of the motion.
         motion: with its frame rate.
         floor: its height [m].
     """
+    speeds = _speeds(track.joints, motion.fps) / (SLOW * track.height)
     if motion.contacts is not None:
-        return motion.contacts
-    slow = _speeds(track.joints, motion.fps) < SLOW * track.height
-    return slow & (track.soles < floor + LOW * track.height)
+        return motion.contacts & (speeds < _SLIDING)
+    found = ((speeds < 1) & (track.soles < floor + LOW * track.height)).astype(np.int8)
+    size = 2 * round(_STEADY_SECONDS * motion.fps / 2 - 0.25) + 1
+    for first, second in ((maximum_filter1d, minimum_filter1d), (minimum_filter1d, maximum_filter1d)):
+        found = second(first(found, size, axis=0, mode="nearest"), size, axis=0, mode="nearest")
+    return found > 0
 
 
 def _speeds(points: np.ndarray, fps: float) -> np.ndarray:
@@ -206,14 +217,14 @@ def planted_path(track: FootTrack, contacts: np.ndarray, fps: float) -> np.ndarr
         sum |v + d'|² + |d|² / return² + (smooth |d''|)²,
 
     so it follows the feet, returns where none stands, and does not jerk. Feet that slide on purpose, faster
-    than twice what counts as slow, are let slide.
+    than what counts as slow, are let slide more and more.
     """
     frames = len(contacts)
     if frames < 3:
         return np.zeros((frames, 3))
     velocity = fps * np.diff(track.joints, axis=0)
-    excess = np.linalg.norm(velocity, axis=-1) / (SLOW * track.height) - 1
-    weight = np.clip(1 - excess, 0, 1) * (contacts[1:] & contacts[:-1])
+    speed = np.linalg.norm(velocity, axis=-1) / (SLOW * track.height)
+    weight = np.clip((_SLIDING - speed) / (_SLIDING - 1), 0, 1) * (contacts[1:] & contacts[:-1])
     step, turn = (
         fps * scipy.sparse.diags_array([-1.0, 1.0], offsets=[0, 1], shape=(count - 1, count))
         for count in (frames, frames - 1)

@@ -83,6 +83,22 @@ def test_low_and_slow_feet_stand(standing_clip):
     assert not found[:, 3].any()
 
 
+def test_contacts_flicker_neither_where_they_are_found_nor_hold_what_runs(standing_clip):
+    joints, soles = np.zeros((40, 4, 3)), np.zeros((40, 4))
+    soles[20, 0] = 1.0  # one frame
+    soles[:, 1] = 1.0
+    soles[20, 1] = 0.0
+    joints[20:, 2, 2] = 2.0 * np.arange(20) / FPS
+    still = standing_clip.cut(np.zeros(40, int))
+    found = contacts_of(track(joints, soles), replace(still, contacts=None), 0.0)
+    assert found[:, 0].all()
+    assert not found[:, 1].any()
+    told = contacts_of(track(joints, soles), still, 0.0)  # the file says that all stand
+    assert told[:, [0, 1, 3]].all()
+    assert told[:19, 2].all()
+    assert not told[22:, 2].any()
+
+
 # -- the path -----------------------------------------------------------------------------------------
 
 
