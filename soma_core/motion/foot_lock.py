@@ -43,7 +43,8 @@ def lock_feet(
     """Pin heels and toes in contact, by the hips, knees and ankles of the legs.
 
     Each contact is held where it is on average, its sole on the floor if it is near. Feet between contacts
-    keep their own path, and knees the side that they bend to. Where a leg does not reach, the Hips sink.
+    keep their own path, and knees the side that they bend to. Where a leg does not reach, the Hips sink, and
+    a foot in the air sinks with them, though not to the floor.
 
     Args:
         motion: rotations and path of the Hips [m] of the body that was posed.
@@ -64,9 +65,12 @@ def lock_feet(
     drops = [leg.drop(ankle) for leg, (ankle, _) in zip(legs, goals, strict=True)]
     drop = _smooth_drop(np.maximum(*drops), motion.fps, _DEEPEST * track.height)
     rotations = motion.rotations.astype(np.float64)
-    for leg, (ankle, turn) in zip(legs, goals, strict=True):
+    for side, (leg, (ankle, turn)) in enumerate(zip(legs, goals, strict=True)):
+        held = np.maximum(pins[2 * side][1], pins[2 * side + 1][1])
+        above = np.maximum(track.soles[:, 2 * side : 2 * side + 2].min(axis=1) - floor, 0)
+        follows = (1 - held) * drop * above / np.maximum(above + drop, 1e-9)
         leg.lower(drop)
-        leg.reach(ankle, turn)
+        leg.reach(ankle - follows[:, None] * [0, 1, 0], turn)
         leg.store(rotations, absolute=motion.convention == "absolute_local")
     path = motion.translation - drop[:, None] * [0, 1, 0]
     return replace(motion, rotations=rotations, translation=path)
