@@ -74,7 +74,7 @@ def read_kimodo_npz(
         name = f", those of {_OTHERS[count]}" if count in _OTHERS else ""
         raise fields.refuse(
             key, got=f"{count} joints{name}", expected="the 30 or 77 joints of the SOMA skeleton",
-            fix="Generate it with a SOMA model, or convert it to AMASS by kimodo_convert.",
+            fix="Generate it with a SOMA model; of SMPL-X, kimodo_convert makes AMASS files.",
         )  # fmt: skip
     check_rotations(f"{fields.path}: {key}", stored)
     names = _ORDERS[count]

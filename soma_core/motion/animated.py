@@ -64,13 +64,18 @@ class Animated:
 
 
 def load_clip(
-    path: str | Path | None = None, *, fps: float | None = None, frames: FrameRange | None = None
+    path: str | Path | None = None,
+    *,
+    fps: float | None = None,
+    person: str | None = None,
+    frames: FrameRange | None = None,
 ) -> Motion:
     """Some frames of a motion file.
 
     Args:
         path: a motion on this skeleton; None for the clip that ships with the project.
         fps: frame rate, where the file has none.
+        person: which sample of a file of several, ``0`` for the first.
         frames: which; None for all.
 
     Raises:
@@ -78,7 +83,7 @@ def load_clip(
         InputError: no frame is left.
     """
     path = Path(path).expanduser() if path else assets_dir() / "motions/range_of_motion.npz"
-    motion, frames = read_motion(path, fps=fps), frames or FrameRange()
+    motion, frames = read_motion(path, fps=fps, person=person), frames or FrameRange()
     part = slice(frames.start, frames.stop, frames.step)
     if part.step < 1 or not len(range(motion.frame_count)[part]):
         raise InputError(

@@ -50,7 +50,7 @@ def run(config: DictConfig, output: Path) -> None:
 
         draw_gallery(options, output / "gallery.png")
         return
-    motion = load_clip(options.motion, fps=options.motion_fps, frames=options.frames)
+    motion = load_clip(options.motion, fps=options.motion_fps, person=options.person, frames=options.frames)
     kept, chosen = options.identity_from == "motion", options.backend
     name, own = chosen.name, chosen.options
     if kept:
