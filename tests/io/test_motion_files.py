@@ -441,7 +441,12 @@ def test_recorded_kimodo_motions(path, tmp_path):
     motion = read_motion(path)
     assert 0.3 < motion.translation[:, 1].min() < motion.translation[:, 1].max() < 1.6  # one of them jumps
     write_motion(motion, tmp_path / "m.npz")
-    np.testing.assert_array_equal(read_motion(tmp_path / "m.npz").rotations, motion.rotations)
+    again = read_motion(tmp_path / "m.npz")
+    np.testing.assert_array_equal(again.rotations, motion.rotations)
+    np.testing.assert_array_equal(again.contacts, np.load(path)["foot_contacts"])
+    np.testing.assert_array_equal(again.skeleton, motion.skeleton)
+    bones = [USER_JOINTS.index(side + part) for side in ("Left", "Right") for part in ("Shin", "Foot")]
+    assert np.linalg.norm(again.skeleton[bones], axis=1).sum() / 2 == pytest.approx(0.8558, abs=1e-3)
 
 
 # -- GEM-X --------------------------------------------------------------------------------------------
