@@ -21,11 +21,13 @@ __all__ = [
     "BodyGender",
     "BvhChoice",
     "BvhRest",
+    "Contacts",
     "ConvertResult",
     "EulerOrder",
     "FitLod",
     "FrameRange",
     "Gallery",
+    "Ground",
     "IdentityChoice",
     "IdentityMethod",
     "IdentitySource",
@@ -60,6 +62,13 @@ class SmplLayout(StrEnum):
     smplx = "smplx"
 
 
+class Contacts(StrEnum):
+    """What becomes of feet in contact with the ground: they go with the legs, or stay where they stand."""
+
+    free = "free"
+    lock = "lock"
+
+
 class ConvertResult(StrEnum):
     """What the way back gives: pose parameters of the model, or vertices."""
 
@@ -79,6 +88,14 @@ class Gallery(StrEnum):
 
     one = "one"
     all = "all"
+
+
+class Ground(StrEnum):
+    """What lies on the floor: soles in contact, the lowest vertex of the clip, or nothing that is sought."""
+
+    contacts = "contacts"
+    lowest = "lowest"
+    none = "none"
 
 
 class IdentityMethod(StrEnum):

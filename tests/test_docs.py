@@ -83,6 +83,8 @@ def test_the_table_of_motion_keys_is_complete(tmp_path):
         translation=np.zeros((2, 3)),
         fps=30,
         joint_names=USER_JOINTS,
+        contacts=np.zeros((2, 4), bool),
+        skeleton=np.zeros((77, 3)),
         identity={
             "backend": "soma",
             "params": {"shape": [1.0]},

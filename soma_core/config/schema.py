@@ -12,9 +12,11 @@ from soma_core.motion.options import ConvertOptions, InvertOptions
 from soma_core.motion.writers import WriteOptions, listed_writers
 from soma_core.options import (
     BackendChoice,
+    Contacts,
     FitLod,
     FrameRange,
     Gallery,
+    Ground,
     IdentitySource,
     Kernels,
     LengthUnit,
@@ -53,9 +55,12 @@ class _PlayedMotion(Options):
     backends: Gallery = Gallery.one
     motion: str | None = None
     motion_fps: float | None = None
+    person: str | None = None
     identity_from: IdentitySource = IdentitySource.backend
     frames: FrameRange = field(default_factory=FrameRange)
     translation: Translation = Translation.ground
+    ground: Ground | None = None
+    contacts: Contacts = Contacts.free
 
 
 @dataclass(kw_only=True)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-__all__ = ["KIMODO_30_JOINTS", "PARENT_NAMES", "USER_JOINTS", "nearest_ancestors"]
+__all__ = ["CONTACT_JOINTS", "KIMODO_30_JOINTS", "PARENT_NAMES", "USER_JOINTS", "nearest_ancestors"]
 
 _FINGERS = {"Thumb": 3, "Index": 4, "Middle": 4, "Ring": 4, "Pinky": 4}
 
@@ -44,6 +44,9 @@ PARENT_NAMES: dict[str, str] = (
 
 USER_JOINTS: tuple[str, ...] = tuple(PARENT_NAMES)
 """The 77 joints that a pose controls, Hips first."""
+
+CONTACT_JOINTS = ("LeftFoot", "LeftToeBase", "RightFoot", "RightToeBase")
+"""Joints at heels and toes, in the order of a file's foot contacts."""
 
 
 def _kimodo_arm(side: str) -> tuple[str, ...]:

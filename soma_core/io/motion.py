@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import numpy as np
 
 from soma_core.errors import InputError
+from soma_core.io.joint_order import CONTACT_JOINTS
 
 __all__ = ["Convention", "Motion"]
 
@@ -31,6 +32,10 @@ class Motion:
             there were any, and under ``rest`` a rest shape (v, 3) [m] on the canonical mesh if no parameters
             describe it.
         licence: licence or terms of the motion, empty if unknown.
+        contacts: (frames, 4) whether ``CONTACT_JOINTS`` stand on the ground: left heel, left toes, right
+            heel, right toes; None if unknown.
+        skeleton: (77, 3) float32 from the parent to each joint in the T-pose [m], of the body that was
+            recorded; NaN for a joint whose bone is unknown, None if all are.
 
     Raises:
         InputError: a shape, a value, the frame rate or the convention cannot be a motion.
@@ -45,6 +50,8 @@ class Motion:
     source: str = ""
     identity: Mapping[str, object] = field(default_factory=dict)
     licence: str = ""
+    contacts: np.ndarray | None = None
+    skeleton: np.ndarray | None = None
 
     def __post_init__(self) -> None:
         rotations = np.asarray(self.rotations, np.float32)
@@ -54,6 +61,7 @@ class Motion:
         frames = len(rotations) if rotations.ndim else 0
         _expect("rotations", rotations, (frames, len(self.joint_names), 3, 3))
         _expect("translation", translation, (frames, 3))
+        self._check_recorded(frames)
         if frames == 0:
             raise InputError("rotations", got="0 frames", expected="at least one", fix="Give a longer clip.")
         if not (np.isfinite(self.fps) and self.fps > 0):
@@ -71,10 +79,32 @@ class Motion:
                 fix="Say which zero the rotations have.",
             )
 
+    def _check_recorded(self, frames: int) -> None:
+        """Bring what is known of the recorded body to its types."""
+        if self.contacts is not None:
+            contacts = np.asarray(self.contacts, bool)
+            _expect("contacts", contacts, (frames, len(CONTACT_JOINTS)))
+            object.__setattr__(self, "contacts", contacts)
+        if self.skeleton is not None:
+            skeleton = np.asarray(self.skeleton, np.float32)
+            _expect("skeleton", np.nan_to_num(skeleton, nan=0.0), (len(self.joint_names), 3))
+            object.__setattr__(self, "skeleton", skeleton)
+
     @property
     def frame_count(self) -> int:
         """Number of frames."""
         return len(self.rotations)
+
+    def cut(self, frames: slice | np.ndarray) -> Motion:
+        """Some of the frames, with all that is kept of each; the frame rate stays.
+
+        Args:
+            frames: a slice, or numbers of frames.
+        """
+        contacts = None if self.contacts is None else self.contacts[frames]
+        return replace(
+            self, rotations=self.rotations[frames], translation=self.translation[frames], contacts=contacts
+        )
 
 
 def _expect(argument: str, array: np.ndarray, shape: tuple[int, ...]) -> None:

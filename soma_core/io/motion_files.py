@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from soma_core.cache import atomic_arrays
 from soma_core.errors import InputError
+from soma_core.io.gem_x import gem_x_motion, gem_x_parts
 from soma_core.io.joint_order import USER_JOINTS
 from soma_core.io.kimodo_npz import read_kimodo_npz
 from soma_core.io.motion import Convention, Motion
@@ -22,7 +23,7 @@ from soma_core.io.soma_npz import SCHEMA_VERSION, read_soma_npz
 
 __all__ = ["check_rig", "read_motion", "write_motion", "write_motion_parts"]
 
-_LONG = {"poses": "rotations", "transl": "translation"}
+_LONG = {"poses": "rotations", "transl": "translation", "foot_contacts": "contacts"}
 """Keys of a file that hold an entry a frame, and the field of a motion that they come from."""
 
 
@@ -32,14 +33,16 @@ def read_motion(
     fps: float | None = None,
     unit: str | None = None,
     convention: Convention | None = None,
+    person: str | None = None,
 ) -> Motion:
-    """Read a motion from an NPZ file: our schema, the SOMA tools' files, or kimodo's.
+    """Read a motion from an NPZ file: our schema, the SOMA tools' files, kimodo's or GEM-X's.
 
     Args:
         path: the file. Nothing in it is executed; keys that are not needed are ignored.
-        fps: frame rate; needed where the file has none (SOMA tools). kimodo files count as 30.
+        fps: frame rate; needed where the file has none (SOMA tools, GEM-X). kimodo files count as 30.
         unit: ``meters``, ``centimeters`` or ``millimeters``; overrides the file's own.
         convention: what zero means; overrides the file's own.
+        person: which of the samples of kimodo or the people of GEM-X, from ``0``.
 
     Returns:
         The motion in metres, +Y up, 77 joints with Hips first.
@@ -50,13 +53,16 @@ def read_motion(
     """
     with open_npz(path) as fields:
         if "global_rot_mats" in fields or "local_rot_mats" in fields:
-            return read_kimodo_npz(fields, fps=fps)
+            return read_kimodo_npz(fields, fps=fps, unit=unit, person=person)
         if "schema_version" in fields or ("poses" in fields and "transl" in fields):
             return read_soma_npz(fields, fps=fps, unit=unit, convention=convention)
+        parts = gem_x_parts(fields)
+        if parts is not None:
+            return gem_x_motion(parts, path=fields.path, fps=fps, person=person)
         raise fields.refuse(
             "layout",
             got=f"the keys {', '.join(fields.names) or '(none)'}",
-            expected="'poses' and 'transl' (SOMA), or 'global_rot_mats' (kimodo)",
+            expected="'poses' and 'transl' (SOMA), 'global_rot_mats' (kimodo), or 'body_pose' (GEM-X)",
             fix="Convert the motion to the SOMA skeleton first.",
         )
 
@@ -113,7 +119,7 @@ def write_motion_parts(
     arrays = _arrays(first, "matrix")
     if joint_orient is not None and first.convention == "t_pose_relative":
         arrays["joint_orient"] = np.asarray(joint_orient, np.float32)
-    pieces = {name: functools.partial(_pieces, parts, name) for name in _LONG}
+    pieces = {name: functools.partial(_pieces, parts, name) for name in _LONG if name in arrays}
     write_npz_parts(path, arrays, pieces, count=frame_count)
 
 
@@ -158,7 +164,9 @@ def _arrays(motion: Motion, rotation_repr: str) -> dict[str, np.ndarray]:
         "source": motion.source,
         "licence": motion.licence,
     }
-    return {name: np.asarray(value) for name, value in (values | _identity(motion.identity)).items()}
+    recorded = {"foot_contacts": motion.contacts, "skeleton": motion.skeleton}
+    values |= _identity(motion.identity) | {name: kept for name, kept in recorded.items() if kept is not None}
+    return {name: np.asarray(value) for name, value in values.items()}
 
 
 def _identity(identity: Mapping[str, object]) -> dict[str, object]:

@@ -8,16 +8,19 @@ from typing import cast
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from soma_core.io.joint_order import USER_JOINTS
+from soma_core.io.joint_order import CONTACT_JOINTS, USER_JOINTS
 from soma_core.io.motion import Convention, Motion
 from soma_core.io.npz_fields import NpzFields, check_rotations
 from soma_core.topology.frames import METRES_PER_UNIT
 
-__all__ = ["METRES_PER_UNIT", "SCHEMA_VERSION", "read_soma_npz"]
+__all__ = ["LIKELY_CONTACT", "METRES_PER_UNIT", "SCHEMA_VERSION", "read_soma_npz"]
 
 SCHEMA_VERSION = 1
 """Version of the motion schema that this package writes."""
 
+
+LIKELY_CONTACT = 0.5
+"""A contact that is stored as a probability counts from here on."""
 
 _ROOT_TOLERANCE = 1e-4
 """Largest entry of |R_Root - I| accepted: Root is virtual, only rounding may move it."""
@@ -38,7 +41,9 @@ def read_soma_npz(
     _check_schema(fields)
     rotations = _rotations(fields)
     rotations = rotations[:, _columns(fields, rotations)]
-    translation = fields.numbers("transl", (len(rotations), 3)) * _metres(fields, unit)
+    metres = _metres(fields, unit)
+    translation = fields.numbers("transl", (len(rotations), 3)) * metres
+    ours = "schema_version" in fields
     return Motion(
         rotations=rotations,
         translation=translation,
@@ -49,7 +54,31 @@ def read_soma_npz(
         source=fields.text("source", "") or f"SOMA motion file {fields.path.name}",
         identity=_identity(fields),
         licence=fields.text("licence", ""),
+        contacts=_contacts(fields, len(rotations)) if ours else None,
+        skeleton=_skeleton(fields, metres) if ours else None,
     )
+
+
+def _contacts(fields: NpzFields, frames: int) -> np.ndarray | None:
+    """Heels and toes on the ground, (frames, 4) bool; stored as truth or as how likely it is."""
+    if "foot_contacts" not in fields:
+        return None
+    return fields.numbers("foot_contacts", (frames, len(CONTACT_JOINTS))) > LIKELY_CONTACT
+
+
+def _skeleton(fields: NpzFields, metres: float) -> np.ndarray | None:
+    """Offsets (77, 3) of the joints of the recorded body [m]; those that are unknown are NaN."""
+    if "skeleton" not in fields:
+        return None
+    offsets = fields.raw("skeleton")
+    if offsets.dtype.kind != "f" or offsets.shape != (len(USER_JOINTS), 3):
+        raise fields.refuse(
+            "skeleton",
+            got=f"{offsets.dtype} of shape {offsets.shape}",
+            expected=f"({len(USER_JOINTS)}, 3) numbers, NaN for unknown bones",
+            fix="Store the offset of each joint from its parent in the T-pose, or leave the key out.",
+        )
+    return metres * offsets.astype(np.float64)
 
 
 def _check_schema(fields: NpzFields) -> None:

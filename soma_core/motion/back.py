@@ -21,7 +21,7 @@ from soma_core.motion.models import model_settings
 from soma_core.motion.native_errors import NativeErrors
 from soma_core.motion.native_results import NativeTarget, ParameterTarget, SmplTarget, VertexTarget
 from soma_core.motion.options import ConvertOptions
-from soma_core.motion.played import MovingBodies, Played
+from soma_core.motion.played import MovingBodies, Played, placing_of
 from soma_core.native import NativeFit, NativeTransfer, ParameterFit
 from soma_core.options import Product, SmplLayout
 from soma_core.progress import progress
@@ -40,7 +40,7 @@ class BackConverter:
 
     def __init__(self, options: ConvertOptions) -> None:
         self._options = options
-        self._bodies = MovingBodies(options, options.backend, str(options.translation))
+        self._bodies = MovingBodies(options, options.backend, placing_of(options))
         self._targets: dict[str, NativeFit | NativeTransfer | ParameterFit] = {}
 
     @torch.no_grad()
@@ -54,13 +54,13 @@ class BackConverter:
                 expected="a motion on this skeleton, for the way back",
                 fix="Convert it with to=soma first.",
             )
-        motion = read(path, fps=self._options.fps, unit=self._options.unit)
+        motion = read(path, fps=self._options.fps, unit=self._options.unit, person=self._options.person)
         layer, stored = self._bodies.layer_of(path, motion)
-        target = self._target(stored)
+        target, placing = self._target(stored), placing_of(self._options)
         settings = {
             "input": str(path.resolve()), "layout": layout, "fps": motion.fps, "body": stored["backend"],
-            "body_params": stored.get("params"), "translation": str(self._options.translation),
-            **model_settings(layer), **target.facts, "content": fingerprint(path),
+            "body_params": stored.get("params"), **placing, **model_settings(layer), **target.facts,
+            "content": fingerprint(path),
         }  # fmt: skip
         vertices = isinstance(target, VertexTarget)
         results = target.results(files)

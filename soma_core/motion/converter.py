@@ -123,7 +123,7 @@ class Converter:
 
     def _carry_over(self, path: Path, layout: Layout, files: ResultFiles) -> Converted:
         """Write the rotations of a file on this skeleton as they are, in metres."""
-        motion = read(path, fps=self._options.fps, unit=self._options.unit)
+        motion = read(path, fps=self._options.fps, unit=self._options.unit, person=self._options.person)
         write(motion, files.motion)
         report = {
             "settings": {"input": str(path.resolve()), "layout": layout, "fps": motion.fps},

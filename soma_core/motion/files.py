@@ -9,6 +9,7 @@ from typing import Literal
 
 from soma_core.errors import InputError
 from soma_core.io.amass import holds_smpl_motion
+from soma_core.io.gem_x import gem_x_parts
 from soma_core.io.motion import Motion
 from soma_core.io.motion_files import read_motion, write_motion
 from soma_core.io.npz_fields import open_npz
@@ -87,18 +88,27 @@ def layout_of(path: str | Path) -> Layout | None:
             return "kimodo"
         if "pred_vertices" in fields:
             return "sam3d"
+        if gem_x_parts(fields) is not None:
+            return "soma"
         if holds_smpl_motion(fields):
             return "amass"
         return "soma" if "schema_version" in fields or {"poses", "transl"} <= {*fields.names} else None
 
 
-def read(path: str | Path, *, fps: float | None = None, unit: LengthUnit | str | None = None) -> Motion:
+def read(
+    path: str | Path,
+    *,
+    fps: float | None = None,
+    unit: LengthUnit | str | None = None,
+    person: str | None = None,
+) -> Motion:
     """Read a motion on this skeleton: a file of this project, of the SOMA tools or of kimodo.
 
     Args:
         path: the file. What other skeletons move in is for :func:`convert`.
         fps: frame rate, where the file has none.
         unit: ``m``, ``cm`` or ``mm``; overrides the file's own.
+        person: which of the samples of kimodo or the people of GEM-X, from ``0``.
 
     Raises:
         AssetError: the file is missing, damaged, a git-LFS pointer or no NPZ.
@@ -110,7 +120,7 @@ def read(path: str | Path, *, fps: float | None = None, unit: LengthUnit | str |
         )
     metres = METRES[str(unit)] if unit else None
     name = next((name for name, length in METRES_PER_UNIT.items() if length == metres), None)
-    return read_motion(path, fps=fps, unit=name)
+    return read_motion(path, fps=fps, unit=name, person=person)
 
 
 def write(motion: Motion, path: str | Path) -> None:

@@ -21,6 +21,7 @@ from soma_core.motion.bodies import ShownBody, open_body
 from soma_core.motion.chunks import FittedChunks
 from soma_core.motion.files import ResultFiles, fingerprint
 from soma_core.motion.fit_results import chunk_arrays, draw_worst, fitted_motions, joined_report, per_frame
+from soma_core.motion.ground import skeleton_of
 from soma_core.motion.identities import found_identity, stored_identity
 from soma_core.motion.models import model_settings
 from soma_core.motion.options import FitOptions
@@ -192,10 +193,11 @@ class FitJob:
         chunks, files, picture = plan.chunks, plan.files, plan.options.picture
         source = f"fitted to {plan.source.name}"
         identity = {**plan.stored, **({"options": layer.options} if layer.options else {})}
+        skeleton = skeleton_of(layer.rig, self.identity)
         write_motion_parts(
             lambda: fitted_motions(
                 chunks, layer, fps=plan.settings["fps"], source=source, identity=identity,
-                licence=self.body.licence,
+                skeleton=skeleton, licence=self.body.licence,
             ),
             files.motion,
             frame_count=chunks.frame_count,

@@ -92,9 +92,10 @@ def fitted_motions(
     fps: float,
     source: str,
     identity: Mapping[str, Any],
+    skeleton: np.ndarray | None = None,
     licence: str = "",
 ) -> Iterator[Motion]:
-    """The fitted motion, a chunk at a time."""
+    """The fitted motion, a chunk at a time; `skeleton` is that of the identity."""
     for rotations, translation in chunks.load_all("rotations", "translation"):
         yield Motion(
             rotations=rotations,
@@ -104,6 +105,7 @@ def fitted_motions(
             rig_revision=layer.rig.revision,
             source=source,
             identity=identity,
+            skeleton=skeleton,
             licence=licence,
         )
 

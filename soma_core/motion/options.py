@@ -9,8 +9,10 @@ from soma_core.motion.writers import MESH_WRITERS, WriteOptions
 from soma_core.options import (
     BackendChoice,
     BodyGender,
+    Contacts,
     ConvertResult,
     FitLod,
+    Ground,
     IdentityChoice,
     InversionChoice,
     LengthUnit,
@@ -98,7 +100,10 @@ class ConvertOptions(WriteOptions, FitOptions):
         betas: shape coefficients of the model, on the way back; None: the body's own, or the nearest.
         num_betas: how many are written; None: as many as the body's file or the model has, 10 at least.
         layout: names of the keys that poses of SMPL models are written under; None: those of AMASS.
+        person: whose motion, in a file of several people.
         translation: where the body stands, on the way back and in what is written of a body.
+        ground: what lies on the floor then; None: the usual for that translation.
+        contacts: whether feet that stand are pinned then.
     """
 
     to: str = "soma"
@@ -107,9 +112,11 @@ class ConvertOptions(WriteOptions, FitOptions):
     gender: BodyGender | None = None
     most_betas: int | None = None
     betas: list[float] | None = None
-    num_betas: int | None = None
     layout: SmplLayout | None = None
+    person: str | None = None
     translation: Translation = Translation.motion
+    ground: Ground | None = None
+    contacts: Contacts = Contacts.free
 
     def __post_init__(self) -> None:
         """Refuse settings of the other direction, which would change nothing."""
@@ -124,9 +131,11 @@ class ConvertOptions(WriteOptions, FitOptions):
         why = f"to={self.to}"
         if self.to == "soma":
             placed = None if self.translation == "motion" or self.shown else str(self.translation)
+            held = None if self.contacts == "free" or self.shown else str(self.contacts)
             unused = {
                 "betas": self.betas, "num_betas": self.num_betas, "layout": self.layout,
-                "result": self.result, "translation": placed,
+                "result": self.result, "translation": placed, "contacts": held,
+                "ground": None if self.shown else self.ground,
             }  # fmt: skip
             if self.backend is not None and sought is None and self.backend.name != "mhr" and not self.shown:
                 unused["backend"] = self.backend.name  # a file tells its own model

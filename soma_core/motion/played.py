@@ -26,12 +26,13 @@ from soma_core.layer import SomaLayer
 from soma_core.motion.animated import animate
 from soma_core.motion.identities import stored_identity
 from soma_core.motion.models import open_layer
+from soma_core.motion.options import ConvertOptions
 from soma_core.options import BackendChoice, ModelOptions
 from soma_core.skeleton.identity import Identity
 from soma_core.topology.frames import native_to_canonical
 from soma_core.view.picture import backend_colour
 
-__all__ = ["MovingBodies", "Played"]
+__all__ = ["MovingBodies", "Played", "placing_of"]
 
 _log = logging.getLogger(__name__)
 
@@ -146,17 +147,26 @@ class Played:
         return JointPiece(shown[..., 3], shown[..., :3])
 
 
+def placing_of(options: ConvertOptions) -> dict[str, str]:
+    """Where a body is to stand: arguments of ``animate``, as far as they are not the usual ones."""
+    chosen = {"translation": options.translation, "ground": options.ground, "contacts": options.contacts}
+    usual = {"ground": None, "contacts": "free"}
+    return {name: str(value) for name, value in chosen.items() if value != usual.get(name, "")}
+
+
 class MovingBodies:
     """Bodies that motions move; layers that are made once serve all of them.
 
     Args:
         options: of the model.
         chosen: whose body moves; None: that of each motion file.
-        translation: where it stands, as for ``animate``.
+        placing: where it stands: arguments of ``animate``.
     """
 
-    def __init__(self, options: ModelOptions, chosen: BackendChoice | None, translation: str) -> None:
-        self._options, self._chosen, self._translation = options, chosen, translation
+    def __init__(
+        self, options: ModelOptions, chosen: BackendChoice | None, placing: Mapping[str, str]
+    ) -> None:
+        self._options, self._chosen, self._placing = options, chosen, placing
         self._layers: dict[str, SomaLayer] = {}
 
     def layer_of(self, path: Path, motion: Motion) -> tuple[SomaLayer, Mapping[str, Any]]:
@@ -193,6 +203,6 @@ class MovingBodies:
             )
         with torch.no_grad():
             identity = stored_identity(layer, stored)
-            if self._translation != "motion":
-                motion = animate(layer, identity, motion, translation=self._translation).motion
+            if self._placing != {"translation": "motion"}:
+                motion = animate(layer, identity, motion, **self._placing).motion
         return Played(layer=layer, identity=identity, motion=replace(motion, identity=stored))

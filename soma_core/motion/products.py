@@ -19,7 +19,7 @@ from soma_core.layer import SomaLayer
 from soma_core.motion.files import ResultFiles, fingerprint, write
 from soma_core.motion.models import model_settings
 from soma_core.motion.options import ConvertOptions
-from soma_core.motion.played import MovingBodies, Played
+from soma_core.motion.played import MovingBodies, Played, placing_of
 from soma_core.motion.writers import WRITERS, WriteOptions
 from soma_core.options import BvhChoice, Picture, Product
 from soma_core.skeleton.identity import Identity
@@ -37,9 +37,9 @@ class BodyProducts:
     """
 
     def __init__(self, options: ConvertOptions) -> None:
-        self._options, translation = options, str(options.translation)
-        self._own = MovingBodies(options, None, translation)
-        self._chosen = MovingBodies(options, options.backend, translation)
+        self._options, self._placing = options, placing_of(options)
+        self._own = MovingBodies(options, None, self._placing)
+        self._chosen = MovingBodies(options, options.backend, self._placing)
 
     def __call__(
         self,
@@ -71,7 +71,7 @@ class BodyProducts:
         camera = None if options.camera is None else fingerprint(Path(options.camera).expanduser())
         settings = {
             "content": fingerprint(path), **model_settings(layer), "backend": layer.backend,
-            "params": stored.get("params"), "options": layer.options, "translation": str(options.translation),
+            "params": stored.get("params"), "options": layer.options, **self._placing,
             "joints": options.joints, "camera": camera, "write_up": options.write_up,
             "bvh": asdict(options.bvh), "picture": asdict(options.picture),
         }  # fmt: skip

@@ -43,7 +43,7 @@ def run(config: DictConfig, output: Path) -> None:
         draw_gallery(options, output / "gallery.png")
         return
     options.refuse_unused(options.write)
-    motion = load_clip(options.motion, fps=options.motion_fps, frames=options.frames)
+    motion = load_clip(options.motion, fps=options.motion_fps, person=options.person, frames=options.frames)
     kept, chosen = options.identity_from == "motion", options.backend
     name, own = chosen.name, chosen.options
     if kept:
@@ -54,7 +54,10 @@ def run(config: DictConfig, output: Path) -> None:
     _log.info("%s: %d frames at %g fps", motion.source, motion.frame_count, motion.fps)
     with torch.no_grad():
         identity = stored_identity(layer, stored)
-        placed = animate(layer, identity, motion, translation=str(options.translation)).motion
+        placed = animate(
+            layer, identity, motion, translation=options.translation, ground=options.ground,
+            contacts=options.contacts,
+        ).motion  # fmt: skip
     played = Played(layer=layer, identity=identity, motion=replace(placed, identity=stored))
     written = write_products(
         played, options.write, lambda product: output / WRITERS[product].file,

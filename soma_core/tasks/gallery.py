@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -50,9 +49,10 @@ def draw_gallery(options: AnimateConfig, path: Path) -> None:
     Raises:
         SomaError: no backend is usable, or pyvista is not installed.
     """
-    motion = load_clip(options.motion, fps=options.motion_fps, frames=options.frames)
+    motion = load_clip(options.motion, fps=options.motion_fps, person=options.person, frames=options.frames)
     frame = motion.frame_count // 2 if options.motion else round(_POSE_SECOND * motion.fps)
-    pose = _one_frame(motion, min(frame, motion.frame_count - 1))
+    frame = min(frame, motion.frame_count - 1)
+    pose = motion.cut(slice(frame, frame + 1))
     bodies = []
     for name in default_registry().names():
         try:
@@ -63,11 +63,6 @@ def draw_gallery(options: AnimateConfig, path: Path) -> None:
         raise SomaError("no backend is usable. Run: soma backends")
     gallery(path, bodies, width=options.picture.width)
     _log.info("wrote %d bodies", len(bodies))
-
-
-def _one_frame(motion: Motion, frame: int) -> Motion:
-    part = slice(frame, frame + 1)
-    return replace(motion, rotations=motion.rotations[part], translation=motion.translation[part])
 
 
 def _random_parameters(spec: BackendSpec, count: int, random: np.random.Generator) -> dict[str, np.ndarray]:

@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 from soma_core.errors import AssetError, InputError
 from soma_core.io import USER_JOINTS, Motion, check_rig, read_motion, write_motion, write_motion_parts
 from soma_core.io.joint_order import KIMODO_30_JOINTS, PARENT_NAMES, nearest_ancestors
+from soma_core.motion import layout_of
 
 ROTVEC_TOLERANCE = 2e-6
 """Matrix entries after a trip through float32 rotation vectors of up to 3 rad."""
@@ -103,6 +104,25 @@ def test_a_rest_shape_goes_with_its_motion(motion, tmp_path):
     np.testing.assert_array_equal(found["rest"], rest)
 
 
+def test_contacts_and_skeleton_go_with_their_motion(motion, tmp_path):
+    contacts = np.random.default_rng(0).random((5, 4)) > 0.5
+    skeleton = np.random.default_rng(1).normal(size=(77, 3)).astype(np.float32)
+    skeleton[3] = np.nan
+    kept = replace(motion, contacts=contacts, skeleton=skeleton)
+    write_motion(kept, tmp_path / "m.npz")
+    write_motion_parts(
+        lambda: iter([kept.cut(slice(0, 2)), kept.cut(np.arange(2, 5))]),
+        tmp_path / "parts.npz",
+        frame_count=5,
+    )
+    for name in ("m.npz", "parts.npz"):
+        again = read_motion(tmp_path / name)
+        np.testing.assert_array_equal(again.contacts, contacts)
+        np.testing.assert_array_equal(again.skeleton, skeleton)
+    write_motion(motion, tmp_path / "m.npz")
+    assert read_motion(tmp_path / "m.npz").contacts is None
+
+
 def test_rotation_vectors_round_trip_to_rounding(motion, tmp_path):
     write_motion(motion, tmp_path / "motion.npz", rotation_repr="rotvec")
     again = read_motion(tmp_path / "motion.npz")
@@ -166,6 +186,8 @@ def test_a_failed_write_leaves_the_old_file(motion, tmp_path, monkeypatch):
         ("source", 3.0, r"source: got dtype float64, expected text"),
         ("identity_options", "[1]", r"identity_options: got '\[1\]', expected a JSON object"),
         ("identity_params", "{age", r"identity_params: got '\{age'"),
+        ("foot_contacts", np.zeros((5, 2)), r"foot_contacts: got shape \(5, 2\)"),
+        ("skeleton", np.zeros((78, 3)), r"skeleton: got float64 of shape \(78, 3\), expected \(77, 3\)"),
         ("identity_rest", np.zeros((4, 2)), r"identity_rest: got float64 of shape \(4, 2\)"),
     ],
 )
@@ -303,11 +325,96 @@ def test_kimodo_local_rotations_compose_to_the_stored_ones(tmp_path):
 
 def test_kimodo_joints_outside_the_thirty_rest(tmp_path):
     motion = read_motion(kimodo_file(tmp_path / "k.npz"))
-    still = [i for i, name in enumerate(USER_JOINTS) if name not in KIMODO_30_JOINTS or name.endswith("End")]
-    assert len(still) == 77 - 26
+    still = [
+        i
+        for i, name in enumerate(USER_JOINTS)
+        if name.endswith(("End", "1")) and "Thumb1" not in name and name != "Spine1" and name != "Neck1"
+    ]
+    assert len(still) == 1 + 2 * (5 + 4 + 1)  # the head's end; a hand's five ends, four palms, a foot's end
     np.testing.assert_array_equal(
         motion.rotations[:, still], np.broadcast_to(np.eye(3), (6, len(still), 3, 3))
     )
+
+
+@pytest.mark.parametrize("side", ["Left", "Right"])
+@pytest.mark.parametrize(
+    ("end", "fingers"), [("ThumbEnd", ["Thumb"]), ("MiddleEnd", ["Index", "Middle", "Ring", "Pinky"])]
+)
+def test_kimodo_finger_ends_are_the_whole_turn_of_their_fingers(tmp_path, side, end, fingers):
+    path = kimodo_file(tmp_path / "k.npz")
+    world = np.load(path)["global_rot_mats"]
+    hand, tip = (KIMODO_30_JOINTS.index(side + name) for name in ("Hand", "Hand" + end))
+    turn = np.swapaxes(world[:, hand], -1, -2) @ world[:, tip]
+    rotations = read_motion(path).rotations.astype(np.float64)
+    for finger in fingers:
+        total = np.eye(3)
+        for part in ("1", "2", "3", "4", "End"):
+            name = f"{side}Hand{finger}{part}"
+            if name in USER_JOINTS:
+                total = total @ rotations[:, USER_JOINTS.index(name)]
+        np.testing.assert_allclose(total, turn, atol=KIMODO_TOLERANCE)
+
+
+def posed(path, **changes):
+    """A kimodo file whose joints are those of a skeleton, and that skeleton."""
+    offsets = np.random.default_rng(8).uniform(-0.4, 0.4, (30, 3))
+    world = random_rotations(6, 30, seed=3)
+    joints = np.zeros((6, 30, 3))
+    joints[:, 0] = np.random.default_rng(9).normal(size=(6, 3))
+    for index, above in enumerate(nearest_ancestors(KIMODO_30_JOINTS)):
+        if above >= 0:
+            joints[:, index] = joints[:, above] + world[:, above] @ offsets[index]
+    return kimodo_file(path, **{"global_rot_mats": world, "posed_joints": joints} | changes), offsets
+
+
+def test_kimodo_keeps_contacts_and_the_skeleton_that_moved(tmp_path):
+    contacts = np.random.default_rng(0).random((6, 4)) > 0.5
+    path, offsets = posed(tmp_path / "k.npz", foot_contacts=contacts)
+    for unit, metres in ((None, 1.0), ("centimeters", 0.01)):
+        motion = read_motion(path, unit=unit)
+        np.testing.assert_array_equal(motion.contacts, contacts)
+        for index, name in enumerate(KIMODO_30_JOINTS):
+            found = motion.skeleton[USER_JOINTS.index(name)]
+            if PARENT_NAMES[name] in KIMODO_30_JOINTS:
+                np.testing.assert_allclose(found, metres * offsets[index], atol=KIMODO_TOLERANCE)
+        assert np.isnan(motion.skeleton[USER_JOINTS.index("LeftHandThumbEnd")]).all()
+    assert read_motion(posed(tmp_path / "k.npz", foot_contacts=None)[0]).contacts is None
+
+
+def test_kimodo_extras_that_are_not_as_they_should_be_are_said_and_left_out(tmp_path, caplog):
+    hips = np.zeros((6, 3))
+    path, _ = posed(
+        tmp_path / "k.npz", foot_contacts=np.zeros((6, 2)), posed_joints=hips, root_positions=hips
+    )
+    motion = read_motion(path)
+    assert motion.contacts is None
+    assert motion.skeleton is None
+    assert "foot_contacts is not used" in caplog.text
+    assert "posed_joints is not used" in caplog.text
+
+
+def test_a_batch_of_kimodo_samples(tmp_path):
+    arrays = {"global_rot_mats": random_rotations(12, 30).reshape(2, 6, 30, 3, 3),
+              "posed_joints": np.random.default_rng(4).normal(size=(2, 6, 30, 3)),
+              "foot_contacts": np.ones((2, 6, 4), bool)}  # fmt: skip
+    both = kimodo_file(tmp_path / "both.npz", **arrays)
+    with pytest.raises(InputError, match=r"got 2 samples, expected one of 0 to 1. Pass person=0"):
+        read_motion(both)
+    with pytest.raises(InputError, match=r"got person=2 of 2 samples"):
+        read_motion(both, person="2")
+    for number in range(2):
+        one = {key: value[number : number + 1] for key, value in arrays.items()}
+        alone = read_motion(kimodo_file(tmp_path / "one.npz", **one))
+        chosen = read_motion(both, person=str(number))
+        np.testing.assert_array_equal(chosen.rotations, alone.rotations)
+        np.testing.assert_array_equal(chosen.translation, alone.translation)
+        np.testing.assert_array_equal(chosen.skeleton, alone.skeleton)
+
+
+@pytest.mark.parametrize(("count", "name"), [(22, "SMPL-X"), (34, "the Unitree G1 robot")])
+def test_other_skeletons_of_kimodo_are_named(tmp_path, count, name):
+    with pytest.raises(InputError, match=f"got {count} joints, those of {name}.*kimodo_convert"):
+        read_motion(kimodo_file(tmp_path / "k.npz", global_rot_mats=random_rotations(6, count)))
 
 
 def test_kimodo_77_joints_are_taken_as_they_are(tmp_path):
@@ -320,7 +427,7 @@ def test_kimodo_77_joints_are_taken_as_they_are(tmp_path):
 
 
 def test_kimodo_refusals(tmp_path):
-    with pytest.raises(InputError, match=r"global_rot_mats: got 24 joints, expected 30 or 77"):
+    with pytest.raises(InputError, match=r"global_rot_mats: got 24 joints, expected the 30 or 77"):
         read_motion(kimodo_file(tmp_path / "k.npz", global_rot_mats=random_rotations(6, 24)))
     with pytest.raises(InputError, match=r"global_rot_mats: got \|RᵀR - I\|"):
         read_motion(kimodo_file(tmp_path / "k.npz", global_rot_mats=2 * random_rotations(6, 30)))
@@ -334,7 +441,62 @@ def test_recorded_kimodo_motions(path, tmp_path):
     motion = read_motion(path)
     assert 0.3 < motion.translation[:, 1].min() < motion.translation[:, 1].max() < 1.6  # one of them jumps
     write_motion(motion, tmp_path / "m.npz")
-    np.testing.assert_array_equal(read_motion(tmp_path / "m.npz").rotations, motion.rotations)
+    again = read_motion(tmp_path / "m.npz")
+    np.testing.assert_array_equal(again.rotations, motion.rotations)
+    np.testing.assert_array_equal(again.contacts, np.load(path)["foot_contacts"])
+    np.testing.assert_array_equal(again.skeleton, motion.skeleton)
+    bones = [USER_JOINTS.index(side + part) for side in ("Left", "Right") for part in ("Shin", "Foot")]
+    assert np.linalg.norm(again.skeleton[bones], axis=1).sum() / 2 == pytest.approx(0.8558, abs=1e-3)
+
+
+# -- GEM-X --------------------------------------------------------------------------------------------
+
+
+def gem_x_arrays(people=1):
+    """Parameters as ``body_params_global`` of GEM-X holds them, and the rotations that they are of."""
+    turns = random_rotations(people * 4, 77, seed=6)
+    vectors = Rotation.from_matrix(turns.reshape(-1, 3, 3)).as_rotvec().reshape(people, 4, 231)
+    random = np.random.default_rng(7)
+    arrays = {
+        "global_orient": vectors[..., :3], "body_pose": vectors[..., 3:],
+        "transl": random.normal(size=(people, 4, 3)), "identity_coeffs": random.normal(size=(people, 4, 45)),
+        "scale_params": random.normal(size=(people, 4, 69)),
+    }  # fmt: skip
+    return arrays, turns.reshape(people, 4, 77, 3, 3)
+
+
+@pytest.mark.parametrize("layout", ["one", "batch of one", "joints", "matrices"])
+def test_gem_x_parameters_are_a_motion_of_this_skeleton(tmp_path, layout):
+    arrays, turns = gem_x_arrays()
+    if layout != "batch of one":
+        arrays = {key: value[0] for key, value in arrays.items()}
+    if layout == "joints":
+        arrays["body_pose"] = arrays["body_pose"].reshape(4, 76, 3)
+    if layout == "matrices":
+        arrays |= {"global_orient": turns[0, :, 0], "body_pose": turns[0, :, 1:]}
+    path = save(tmp_path / "g.npz", **arrays)
+    assert layout_of(path) == "soma"
+    motion = read_motion(path, fps=24)
+    np.testing.assert_allclose(motion.rotations, turns[0], atol=KIMODO_TOLERANCE)
+    np.testing.assert_allclose(motion.translation, arrays["transl"].reshape(4, 3), atol=1e-6)
+    assert motion.identity["backend"] == "mhr"
+    means = arrays["identity_coeffs"].reshape(4, 45).mean(axis=0, keepdims=True)
+    np.testing.assert_allclose(motion.identity["identity_coeffs"], means, atol=1e-6)
+    with pytest.raises(InputError, match=r"fps: got no frame rate.*Pass fps=30"):
+        read_motion(path)
+
+
+def test_one_of_the_people_of_gem_x(tmp_path):
+    arrays, turns = gem_x_arrays(people=2)
+    path = save(tmp_path / "g.npz", **arrays)
+    np.testing.assert_allclose(
+        read_motion(path, fps=30, person="1").rotations, turns[1], atol=KIMODO_TOLERANCE
+    )
+    with pytest.raises(InputError, match=r"person: got none of 2 people, expected one of 0, 1"):
+        read_motion(path, fps=30)
+    arrays["body_pose"][1, 2, 5] = np.nan
+    with pytest.raises(InputError, match=r"body_pose: got shape \(2, 4, 228\)"):
+        read_motion(save(tmp_path / "g.npz", **arrays), fps=30, person="1")
 
 
 # -- joints, motions, rigs ----------------------------------------------------------------------------

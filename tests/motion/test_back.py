@@ -117,6 +117,11 @@ def test_the_body_can_be_put_on_the_ground(tmp_path):
     with open_vertex_sequence(tmp_path / "ground/vertices.npz") as sequence:
         lowest = sequence.metres * sequence.read(0, 1)[..., "xyz".index(sequence.up[1])].min()
     assert abs(lowest) < 0.02
+    found = converted(
+        tmp_path / "m.npz", tmp_path / "low", to="toy", translation="ground", ground="lowest", contacts="lock"
+    )
+    placed = {key: found.report["settings"][key] for key in ("translation", "ground", "contacts")}
+    assert placed == {"translation": "ground", "ground": "lowest", "contacts": "lock"}
 
 
 @pytest.mark.parametrize(

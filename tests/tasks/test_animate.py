@@ -89,7 +89,7 @@ def test_gallery_of_all_backends(tmp_path, monkeypatch):
 def test_ground_puts_the_lowest_vertex_on_the_floor(layer, identity, motion):
     lifted = replace(motion, translation=motion.translation + UP)
     for mode in ("ground", "none"):
-        result = animate(layer, identity, lifted, translation=mode, keep=list(range(3)))
+        result = animate(layer, identity, lifted, translation=mode, ground="lowest", keep=list(range(3)))
         assert abs(lowest(result)) < GROUND_TOLERANCE
         np.testing.assert_array_equal(result.transforms[:, 0], np.tile(np.eye(4), (3, 1, 1)))
         np.testing.assert_allclose(
