@@ -112,6 +112,7 @@ class ConvertOptions(WriteOptions, FitOptions):
     gender: BodyGender | None = None
     most_betas: int | None = None
     betas: list[float] | None = None
+    num_betas: int | None = None
     layout: SmplLayout | None = None
     person: str | None = None
     translation: Translation = Translation.motion
