@@ -32,12 +32,17 @@ class BodyProducts:
 
     Args:
         options: of the conversion.
+
+    Raises:
+        SomaError: the camera is none.
     """
 
     def __init__(self, options: ConvertOptions) -> None:
         self._options, translation = options, str(options.translation)
         self._own = MovingBodies(options, None, translation)
         self._chosen = MovingBodies(options, options.backend, translation)
+        if options.camera is not None:
+            read_camera(options.camera)  # before anything is fitted
 
     def __call__(
         self,
