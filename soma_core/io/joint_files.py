@@ -16,6 +16,7 @@ from soma_core.errors import InputError
 from soma_core.io.camera import Camera
 from soma_core.io.joint_order import PARENT_NAMES
 from soma_core.io.npz_parts import write_npz_parts
+from soma_core.plugin.declaration import did_you_mean
 
 __all__ = [
     "JointFrames",
@@ -25,6 +26,9 @@ __all__ = [
     "write_joints_npz",
     "write_keypoints",
 ]
+
+_SHOWN = 12
+"""Names that a refusal lists."""
 
 _COLUMNS = ("x_m", "y_m", "z_m", "qw", "qx", "qy", "qz")
 
@@ -81,12 +85,12 @@ def chosen_joints(wanted: Sequence[str] | None, known: Sequence[str]) -> list[in
         got = (
             (f"{strange[0]!r} twice" if strange[0] in known else repr(strange[0])) if strange else "no joint"
         )
+        shown = list(known[:_SHOWN]) + [f"{len(known) - _SHOWN} more"] * (len(known) > _SHOWN)
+        near = did_you_mean(strange[0].title(), known) if strange else ""
         raise InputError(
-            "joints",
-            got=got,
-            expected=f"names among {', '.join(known)}",
-            fix="Correct the name, or leave it out.",
-        )
+            "joints", got=got, expected=f"names among {', '.join(shown)}",
+            fix=near or "Correct the name, or leave it out.",
+        )  # fmt: skip
     return [known.index(name) for name in wanted]
 
 

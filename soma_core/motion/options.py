@@ -122,6 +122,11 @@ class ConvertOptions(WriteOptions, FitOptions):
     def __post_init__(self) -> None:
         """Refuse settings of the other direction, which would change nothing."""
         super().__post_init__()
+        if self.to == "fbx":
+            raise InputError(
+                "to", got="fbx", expected="what is written without other programs",
+                fix="Pass to=glb; docs/to_fbx.py then makes an FBX of it in Blender.",
+            )  # fmt: skip
         if self.to in list(Product):
             object.__setattr__(self, "write", [*(self.write or []), Product(self.to)])
             object.__setattr__(self, "to", "soma")

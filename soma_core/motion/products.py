@@ -34,12 +34,17 @@ class BodyProducts:
 
     Args:
         options: of the conversion.
+
+    Raises:
+        SomaError: the camera is none.
     """
 
     def __init__(self, options: ConvertOptions) -> None:
         self._options, self._placing = options, placing_of(options)
         self._own = MovingBodies(options, None, self._placing)
         self._chosen = MovingBodies(options, options.backend, self._placing)
+        if options.camera is not None:
+            read_camera(options.camera)  # before anything is fitted
 
     def __call__(
         self,

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from soma_core import SomaLayer
 from soma_core.cli import EXIT_OK, EXIT_USAGE, main
-from soma_core.errors import InputError
+from soma_core.errors import AssetError, InputError
 from soma_core.io import open_vertex_sequence, write_motion
 from soma_core.motion import (
     BackendChoice,
@@ -182,7 +182,14 @@ def test_what_does_not_apply_is_refused(changes, said):
 
 
 def test_what_is_asked_for_can_be_wrong(file, tmp_path, clip):
-    with pytest.raises(InputError, match="joints: got 'Hip', expected names among Hips, Spine1"):
+    with pytest.raises(AssetError, match=r"nix\.json: file is missing"):
+        converted(file, tmp_path / "c", to="keypoints", camera="nix.json")
+    assert not (tmp_path / "c").exists()
+    with pytest.raises(InputError, match="to: got fbx.*to=glb; docs/to_fbx.py"):
+        ConvertOptions(to="fbx")
+    with pytest.raises(
+        InputError, match="joints: got 'Hip', expected names among Hips, Spine1.*mean \"Hips\""
+    ):
         converted(file, tmp_path / "a", write=["joints"], joints=["Hip"])
     write_motion(replace(clip, identity={}), tmp_path / "none.npz")
     with pytest.raises(InputError, match=r"backend: got none, and no body in none\.npz"):
