@@ -20,9 +20,18 @@ __all__ = ["Alignment", "Placed", "align", "chains", "own_alignment", "placed", 
 
 _log = logging.getLogger(__name__)
 
-_UNITS = {**METRES, "inches": 0.0254, "units of 5.6 cm, as CMU's": 0.0254 / 0.45}
-_LEGS = (0.55, 1.4)
-"""Thigh and shin of a person [m], from a child of six to a giant; the first unit that gives this is taken."""
+_UNITS = (
+    *((name, metres, 0.55, 1.4) for name, metres in METRES.items()),
+    ("inches", 0.0254, 0.7, 1.05),
+    ("units of 56 mm, as CMU's", 0.0254 / 0.45, 0.7, 1.05),
+    *((name, metres, 0.2, 2.0) for name, metres in METRES.items()),
+)
+"""Units and the legs, thigh and shin, that speak for them [m]; the first that fits is taken.
+
+Children under six in centimetres have legs like adults in inches, which are more."""
+
+_ANY_LEGS = (0.15, 2.0)
+"""Legs [m] that leave a unit standing which the file tells."""
 
 _STANDING = 0.5
 """Cosine under which legs at rest do not hang below a trunk: the pose is none of a human."""
@@ -129,6 +138,7 @@ def placed(source: SkeletonMotion, match: Mapping[str, int], *, unit: str | None
     metres = METRES[unit] if unit in METRES else _metres(source, match)  # type: ignore[index]
     legs, trunk = _legs_and_trunk(source, match)
     standing = bool(np.all(legs @ trunk < -_STANDING))
+    up = up or source.up
     if up is None:
         rising = trunk - legs.mean(axis=0) if standing else _mean_trunk(source, match)
         axis = int(np.abs(rising).argmax())
@@ -180,15 +190,17 @@ def _metres(source: SkeletonMotion, match: Mapping[str, int]) -> float:
         lengths.append(bones.sum() if known or end is None else 2 * np.linalg.norm(end) if not len(bones)
                        else bones.sum() + np.linalg.norm(end))  # fmt: skip
     legs = float(np.mean(lengths))
-    for name, metres in _UNITS.items():
-        if _LEGS[0] <= legs * metres <= _LEGS[1]:
-            level = logging.INFO if name in METRES else logging.WARNING
-            _log.log(level, "%s: legs of %.3g are taken for %s, %.2f m; unit= says another",
+    if source.metres is not None and _ANY_LEGS[0] <= legs * source.metres <= _ANY_LEGS[1]:
+        return source.metres
+    for name, metres, least, most in _UNITS:
+        if least <= legs * metres <= most:
+            usual = name in METRES and source.metres is None
+            _log.log(logging.INFO if usual else logging.WARNING, "%s: legs of %.3g are read as %s, %.2f m; unit= says another",
                      source.source, legs, name, legs * metres)  # fmt: skip
             return metres
     raise InputError(
         f"{source.source}: unit", got=f"legs of {legs:.3g}",
-        expected=f"{_LEGS[0]} to {_LEGS[1]} m in m, cm, mm or inches", fix="Pass unit=m, cm or mm.",
+        expected=f"{_ANY_LEGS[0]} to {_ANY_LEGS[1]} m in m, cm, mm or inches", fix="Pass unit=m, cm or mm.",
     )  # fmt: skip
 
 

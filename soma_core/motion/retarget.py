@@ -66,7 +66,8 @@ def retarget(
     found = placed(source, match, unit=unit, up=up)
     source, rig = found.source, load_canonical("mid")[1]
     turns = source.turns()
-    own = set(source.names) <= {*USER_JOINTS, "Root"} and own_alignment(found, match, spine, neck, rig)
+    same = all(source.names[joint] == name for name, joint in match.items())
+    own = same and own_alignment(found, match, spine, neck, rig)
     rest = dict(zip(rig.joint_names, rig.t_pose_world[:, :3, 3], strict=True))
     alignment = own or align(found, match, spine, neck, turns, rest)
     goals = {name: turns[:, match[name]] @ turn for name, turn in alignment.turns.items() if name in match}
