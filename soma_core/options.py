@@ -19,6 +19,8 @@ __all__ = [
     "AutogradChoice",
     "BackendChoice",
     "BodyGender",
+    "BoneMatch",
+    "Carry",
     "ConvertResult",
     "FitLod",
     "FrameRange",
@@ -47,6 +49,20 @@ class BodyGender(StrEnum):
     neutral = "neutral"
     male = "male"
     female = "female"
+
+
+class BoneMatch(StrEnum):
+    """Which bones of another skeleton are matched by direction; the others keep their turn since rest."""
+
+    bones = "bones"
+    limbs = "limbs"
+
+
+class Carry(StrEnum):
+    """How a motion of a model comes over: its body is fitted, or its joints are carried."""
+
+    fit = "fit"
+    skeleton = "skeleton"
 
 
 class ConvertResult(StrEnum):

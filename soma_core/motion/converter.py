@@ -14,6 +14,7 @@ from soma_core.errors import InputError, SomaError
 from soma_core.io.motion import Motion
 from soma_core.io.motion_files import read_motion
 from soma_core.motion.bodies import FITTED, open_body
+from soma_core.motion.carried import carried, check_carried
 from soma_core.motion.chunks import refuse_other_settings
 from soma_core.motion.files import Layout, ResultFiles, layout_of, read, write
 from soma_core.motion.fit_job import FitJob, FitPlan, fit_settings, plan_body
@@ -91,9 +92,12 @@ class Converter:
             InputError: it holds no motion, or was fitted before with other settings.
         """
         layout = _known_layout(path)
+        options = self._options
+        check_carried(path, layout, options)
+        if layout == "skeleton" or (layout == "amass" and options.carry == "skeleton"):
+            return _retargeted(path, layout, options, files)
         if layout not in FITTED:
             return self._carry_over(path, layout, files)
-        options = self._options
         body = open_body(path, layout, options, self._backends)
         earlier = earlier_report(files.report, files.motion, fit_settings(path, layout, body, options))
         if earlier is not None:
@@ -116,6 +120,17 @@ class Converter:
         return Converted(report=report, files=files)
 
 
+def _retargeted(path: Path, layout: Layout, options: ConvertOptions, files: ResultFiles) -> Converted:
+    """Write the motion of another skeleton, and what became of each of its joints."""
+    found = carried(path, layout, options)
+    write(found.motion, files.motion)
+    settings = {"input": str(path.resolve()), "layout": layout, "fps": found.motion.fps}
+    report = {"settings": settings, "frames": found.motion.frame_count, "identity": None,
+              "rotations": "carried over by the skeleton", **found.report}  # fmt: skip
+    atomic_text(files.report, json.dumps(report, indent=2) + "\n")
+    return Converted(report=report, files=files)
+
+
 def _known_layout(path: Path) -> Layout:
     """Layout of a file that must hold a motion.
 
@@ -127,7 +142,7 @@ def _known_layout(path: Path) -> Layout:
         raise InputError(
             str(path),
             got="no motion under any key that is known",
-            expected="the keys of an AMASS, SAM 3D Body, kimodo or SOMA file",
+            expected="the keys of an AMASS, SAM 3D Body, kimodo or SOMA file, or a skeleton as BVH, FBX, GLB or USD",
             fix="Vertices over time are what soma invert takes.",
         )
     return layout

@@ -8,6 +8,8 @@ from soma_core.errors import InputError
 from soma_core.options import (
     BackendChoice,
     BodyGender,
+    BoneMatch,
+    Carry,
     ConvertResult,
     FitLod,
     IdentityChoice,
@@ -90,9 +92,18 @@ class ConvertOptions(FitOptions):
         most_betas: how many of a file's shape coefficients are used; None: all.
         betas: shape coefficients of the model, on the way back; None: the body's own, or the nearest.
         translation: where the body stands, on the way back.
+        carry: for models of the SMPL family: ``skeleton`` needs no model file, and reads no betas.
+        mapping: file that says which joint of a skeleton is which, where its names are not known.
+        root: of a file with several skeletons, the one that is read.
+        match: which bones of another skeleton are matched by direction: ``bones`` all, ``limbs`` those of
+            arms, legs and fingers; None: all, but for the SMPL family the limbs.
     """
 
     to: str = "soma"
+    carry: Carry = Carry.fit
+    mapping: str | None = None
+    root: str | None = None
+    match: BoneMatch | None = None
     result: ConvertResult | None = None
     gender: BodyGender | None = None
     most_betas: int | None = None

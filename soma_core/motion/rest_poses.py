@@ -239,6 +239,8 @@ def align(
     neck: Sequence[int],
     turns: np.ndarray,
     rest: Mapping[str, np.ndarray],
+    *,
+    limbs: bool = False,
 ) -> Alignment:
     """Turns of every joint that was found, from the root down: the shortest way for each bone in turn.
 
@@ -249,18 +251,26 @@ def align(
         neck: joints there.
         turns: (frames, J, 3, 3) of the source's joints since its rest pose.
         rest: joint positions of the T-pose here [m].
+        limbs: in a human rest pose, only arms, legs and fingers are matched.
     """
-    return _Aligner(found, match, turns, rest).align(spine, neck)
+    return _Aligner(found, match, turns, rest, limbs=limbs).align(spine, neck)
 
 
 class _Aligner:
     """Turns under way; arguments as for `align`."""
 
     def __init__(
-        self, found: Placed, match: Mapping[str, int], turns: np.ndarray, rest: Mapping[str, np.ndarray]
+        self,
+        found: Placed,
+        match: Mapping[str, int],
+        turns: np.ndarray,
+        rest: Mapping[str, np.ndarray],
+        *,
+        limbs: bool,
     ) -> None:
         self._source, self._standing = found.source, found.standing
         self._match, self._turns, self._rest = match, turns, rest
+        self._limbs = limbs and found.standing
         self._found: dict[str, np.ndarray] = {}
         self._along: dict[int, np.ndarray] = {}
 
@@ -301,7 +311,8 @@ class _Aligner:
             share = number / max(len(joints) - 1, 1)
             bone = here[round(share * (len(here) - 1))]
             there = None if following is None else self._source.rest[following] - self._source.rest[joint]
-            turn = self._turned(turn, bone, there, above, joint, parent_turn=turn)
+            if not self._limbs:
+                turn = self._turned(turn, bone, there, above, joint, parent_turn=turn)
             self._along[joint] = turn
             above = joint
         return above
@@ -327,7 +338,8 @@ class _Aligner:
             parent = PARENT_NAMES[parent]
         above = chest if parent == "Chest" else self._match.get(parent, self._match["Hips"])
         turn, bones = self._found[parent], self._bones(name)
-        if name == "Head" or (name.endswith("ToeBase") and self._standing):
+        trunk = ("Head", "ToeBase", "Shoulder", "Foot") if self._limbs else ("Head", "ToeBase")
+        if name == "Head" or (name.endswith(trunk) and self._standing):
             return self._found["Hips"]
         if bones is None:
             return turn

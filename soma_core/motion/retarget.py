@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from soma_core.errors import InputError
 from soma_core.io.joint_names import match_joints
 from soma_core.io.joint_order import PARENT_NAMES, USER_JOINTS
 from soma_core.io.motion import Motion
@@ -40,6 +41,7 @@ def retarget(
     mapping: Mapping[str, str] | None = None,
     unit: str | None = None,
     up: str | None = None,
+    match: Literal["bones", "limbs"] | str = "bones",
 ) -> Retargeted:
     """Carry the motion of another skeleton over to this one.
 
@@ -57,31 +59,35 @@ def retarget(
         mapping: name of a joint here -> its name there, where names are not known.
         unit: of the source's lengths, ``m``, ``cm`` or ``mm``; None: told by the length of the legs.
         up: upward axis of the source's world, as ``y`` or ``-z``; None: told by its rest pose.
+        match: ``limbs`` matches the bones of arms, legs and fingers alone: where the source rests in a human
+            pose, spine, neck, shoulders and feet turn as they do there, and keep their own shape.
 
     Raises:
         InputError: names that are not known, or a size that fits no unit.
     """
-    match = match_joints(source.names, source.parents, mapping=mapping, source=source.source or "names")
-    spine, neck = chains(source, match)
-    found = placed(source, match, unit=unit, up=up)
+    if match not in ("bones", "limbs"):
+        raise InputError("match", got=repr(match), expected="'bones' or 'limbs'", fix="Correct it.")
+    joints = match_joints(source.names, source.parents, mapping=mapping, source=source.source or "names")
+    spine, neck = chains(source, joints)
+    found = placed(source, joints, unit=unit, up=up)
     source, rig = found.source, load_canonical("mid")[1]
     turns = source.turns()
-    same = all(source.names[joint] == name for name, joint in match.items())
-    own = same and own_alignment(found, match, spine, neck, rig)
+    same = all(source.names[joint] == name for name, joint in joints.items())
+    own = same and own_alignment(found, joints, spine, neck, rig)
     rest = dict(zip(rig.joint_names, rig.t_pose_world[:, :3, 3], strict=True))
-    alignment = own or align(found, match, spine, neck, turns, rest)
-    goals = {name: turns[:, match[name]] @ turn for name, turn in alignment.turns.items() if name in match}
-    for targets, joints in ((_SPINE, spine), (_NECK, neck)):
-        along = [turns[:, joint] @ turn for joint, turn in zip(joints, alignment.chain(joints), strict=True)]
+    alignment = own or align(found, joints, spine, neck, turns, rest, limbs=match == "limbs")
+    goals = {name: turns[:, joints[name]] @ turn for name, turn in alignment.turns.items() if name in joints}
+    for targets, chain in ((_SPINE, spine), (_NECK, neck)):
+        along = [turns[:, joint] @ turn for joint, turn in zip(chain, alignment.chain(chain), strict=True)]
         goals.update(_spread(targets, along, goals.get("Hips")))
     rotations = _local(goals, source.frame_count)
-    path, scale, legs = _path(source, match, turns, goals["Hips"], rest, carried=bool(own))
+    path, scale, legs = _path(source, joints, turns, goals["Hips"], rest, carried=bool(own))
     motion = Motion(
         rotations=rotations, translation=path, fps=source.fps, joint_names=USER_JOINTS, rig_revision=rig.revision,
         source=source.source,
     )  # fmt: skip
-    named = {name: source.names[joint] for name, joint in match.items()}
-    used = {*match.values(), *spine, *neck}
+    named = {name: source.names[joint] for name, joint in joints.items()}
+    used = {*joints.values(), *spine, *neck}
     report = {
         "joints": named, "spine": [source.names[joint] for joint in spine],
         "neck": [source.names[joint] for joint in neck], "rest_pose": alignment.kind, "unit_metres": found.metres,
