@@ -39,6 +39,9 @@ _STANDING = 0.5
 _BENT = 0.1
 """Mean sine of the bend of a knee or elbow that tells its axis."""
 
+_UPRIGHT = 0.7
+"""Cosine between the mean direction of trunks and an axis that they are said to stand along."""
+
 _CLOSE = np.cos(np.radians(15))
 _SAME_POSE = np.cos(np.radians(5))
 
@@ -145,6 +148,7 @@ def placed(source: SkeletonMotion, match: Mapping[str, int], *, unit: str | None
         up = ("+" if rising[axis] > 0 else "-") + "xyz"[axis]
     up = up if up[0] in "+-" else f"+{up}"
     turn = _AXES[up]
+    _warn_lying(source, turn @ _unit(_mean_trunk(source, match)), turn)
     return Placed(source=source.placed(turn, metres, "+y"), metres=metres, up=up, turn=turn, standing=standing)
 
 
@@ -171,6 +175,17 @@ def _mean_trunk(source: SkeletonMotion, match: Mapping[str, int]) -> np.ndarray:
     begin = positions[:, low].mean(axis=1) if low else positions[:, match["Hips"]]
     end = positions[:, high].mean(axis=1) if high else positions[:, match["Hips"]]
     return np.asarray((end - begin).mean(axis=0))
+
+
+def _warn_lying(source: SkeletonMotion, rising: np.ndarray, turn: np.ndarray) -> None:
+    """Say so where trunks stand along another axis than the world is taken to have."""
+    axis = int(np.abs(rising).argmax())
+    if abs(rising[axis]) < _UPRIGHT or (axis == 1 and rising[1] > 0):
+        return
+    stands = turn.T @ (np.sign(rising[axis]) * np.eye(3)[axis])
+    place = int(np.abs(stands).argmax())
+    _log.warning("%s: the body %s in most frames; if not so, pass up=%s%s", source.source,
+                 "is upside down" if axis == 1 else "lies", "" if stands[place] > 0 else "-", "xyz"[place])  # fmt: skip
 
 
 def _unit(vector: np.ndarray) -> np.ndarray:
@@ -304,12 +319,13 @@ class _Aligner:
         self, targets: tuple[str, ...], joints: Sequence[int], after: Sequence[int], above: int, start: str
     ) -> int:
         """Turns of spine or neck; returns its last joint there, or `above` where there is none."""
-        here = [self._rest[b] - self._rest[a] for a, b in itertools.pairwise(targets)]
+        here = np.array([self._rest[name] for name in targets])
+        places = np.linspace(0, len(targets) - 1, len(joints) + 1)
+        here = np.stack([np.interp(places, np.arange(len(targets)), column) for column in here.T], -1)
         turn = self._along.get(above, self._found[start])
         for number, joint in enumerate(joints):
             following = joints[number + 1] if number + 1 < len(joints) else next(iter(after), None)
-            share = number / max(len(joints) - 1, 1)
-            bone = here[round(share * (len(here) - 1))]
+            bone = here[number + 1] - here[number]
             there = None if following is None else self._source.rest[following] - self._source.rest[joint]
             if not self._limbs:
                 turn = self._turned(turn, bone, there, above, joint, parent_turn=turn)
@@ -339,7 +355,9 @@ class _Aligner:
         above = chest if parent == "Chest" else self._match.get(parent, self._match["Hips"])
         turn, bones = self._found[parent], self._bones(name)
         trunk = ("Head", "ToeBase", "Shoulder", "Foot") if self._limbs else ("Head", "ToeBase")
-        if name == "Head" or (name.endswith(trunk) and self._standing):
+        if name == "Head" and not self._standing:
+            return self._head(above, turn)
+        if name.endswith(trunk) and self._standing:
             return self._found["Hips"]
         if bones is None:
             return turn
@@ -347,6 +365,12 @@ class _Aligner:
         if hinge is not None:
             return _frame(_unit(bones[1]), hinge[1]) @ _frame(_unit(bones[0]), hinge[0]).T
         return self._turned(turn, bones[0], bones[1], above, self._match[name], parent_turn=turn)
+
+    def _head(self, above: int, turn: np.ndarray) -> np.ndarray:
+        """The turn by quarters that has people look ahead on average: no bone tells how a head is held."""
+        between = np.swapaxes(self._turns[:, above] @ turn, -1, -2) @ self._turns[:, self._match["Head"]]
+        mean = between.mean(axis=0)
+        return max(_quarter_turns(), key=lambda quarter: float(np.trace(mean @ quarter)))
 
     def _bones(self, name: str) -> tuple[np.ndarray, np.ndarray] | None:
         """The bone of a joint here and there, at rest."""
