@@ -52,7 +52,11 @@ def _glb(path: Path, fps: float | None, root: str | None) -> SkeletonMotion:
     for index, name in _humanoid(document.get("extensions", {})):
         names[index] = name
     skins = document.get("skins", [])
-    joints = {int(joint) for skin in skins for joint in skin["joints"]} or set(range(len(nodes)))
+    joints = {int(joint) for skin in skins for joint in skin["joints"]}
+    if not joints and tracks.turning:
+        joints = set(range(len(nodes)))
+    if not joints:
+        raise ValueError("it holds no skin and no node that turns: no joints")
     joints = _under(path, joints, parents, names, root)
     order = sorted(joints, key=lambda joint: (_depth(parents, joint), joint))
     times, rate = _times(tracks.times, fps)
