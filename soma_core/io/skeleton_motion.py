@@ -194,7 +194,8 @@ def soma_skeleton(motion: Motion, rig: Rig, bind_world: np.ndarray | None = None
         parent = parents[joint]
         bone = bind[parent, :3, :3].T @ (bind[joint, :3, 3] - bind[parent, :3, 3])
         rest[joint] = rest[parent] + orient[parent] @ bone
-    rotations = motion.rotations.astype(np.float64)
+    # Single precision leaves matrices near SO(3), and products down the tree would add that up.
+    rotations = Rotation.from_matrix(motion.rotations.reshape(-1, 3, 3)).as_matrix().reshape(-1, 77, 3, 3)
     if motion.convention == "absolute_local":
         above = np.concatenate([np.eye(3)[None], orient[parents[2:]]])
         rotations = above @ rotations @ np.swapaxes(orient[1:], -1, -2)
