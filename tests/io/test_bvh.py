@@ -70,7 +70,7 @@ def test_thirty_joints_keep_their_places(motion, rig, tmp_path):
 @pytest.mark.parametrize("rest", ["t_pose", "bind"])
 def test_joints_lie_where_the_layer_puts_them(motion, rest, tmp_path):
     layer = SomaLayer("soma", lod="low", dtype=torch.float64, kernels="torch")
-    identity = layer.identity({"shape": 1.5 * torch.randn(128, generator=torch.Generator().manual_seed(1))})
+    identity = layer.identity({"shape": 1.5 * torch.randn(128, generator=torch.Generator().manual_seed(1)).double()})
     posed = layer.pose(identity, torch.tensor(motion.rotations).double(), torch.tensor(motion.translation).double())
     write_bvh(motion, tmp_path / "a.bvh", rig=layer.rig, bind_world=identity.bind_world[0].numpy(), rest=rest)
     found = read_bvh(tmp_path / "a.bvh").placed(np.eye(3), 0.01)
