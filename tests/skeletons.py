@@ -33,11 +33,17 @@ def biped(
         chain = [("collar", above, (0.05 * x, 0.06, 0.0)), ("arm", "collar", (0.13 * x, -0.01, -0.01)),
                  ("elbow", "arm", (0.28 * x, 0.0, -0.01)), ("wrist", "elbow", (0.25 * x, 0.01, 0.01))]  # fmt: skip
         if hands:
-            chain += [("finger1", "wrist", (0.09 * x, 0.0, 0.01)), ("finger2", "finger1", (0.04 * x, -0.005, 0.0))]
+            chain += [
+                ("finger1", "wrist", (0.09 * x, 0.0, 0.01)),
+                ("finger2", "finger1", (0.04 * x, -0.005, 0.0)),
+            ]
         chain += [("thigh", "hips", (0.09 * x, -0.05, 0.0)), ("knee", "thigh", (0.01 * x, -0.41, 0.01)),
                   ("ankle", "knee", (0.0, -0.42, -0.02)), ("toe", "ankle", (0.01 * x, -0.07, 0.13))]  # fmt: skip
         parts = {part for part, *_ in chain}
-        rows += [(side + part, side + parent if parent in parts else parent, place) for part, parent, place in chain]
+        rows += [
+            (side + part, side + parent if parent in parts else parent, place)
+            for part, parent, place in chain
+        ]
     keys = [key for key, *_ in rows]
     parents = np.array([keys.index(parent) if parent else -1 for _, parent, _ in rows])
     rest = np.zeros((len(rows), 3))
@@ -54,11 +60,15 @@ def _called(key: str, names: Mapping[str, str]) -> str:
     return names[part].replace("*", side)
 
 
-def moved(names: tuple[str, ...], parents: np.ndarray, rest: np.ndarray, *, frames: int = 40, seed: int = 0) -> SkeletonMotion:
+def moved(
+    names: tuple[str, ...], parents: np.ndarray, rest: np.ndarray, *, frames: int = 40, seed: int = 0
+) -> SkeletonMotion:
     """A motion of any turns, and of knees and elbows that bend one way, on a walk across the floor."""
     rng, time = np.random.default_rng(seed), np.linspace(0, 6, frames)[:, None, None]
     shape = (1, len(names), 3)
-    vectors = 0.4 * rng.normal(size=shape) * np.sin(rng.uniform(1, 2, shape) * time + rng.uniform(0, 6, shape))
+    vectors = (
+        0.4 * rng.normal(size=shape) * np.sin(rng.uniform(1, 2, shape) * time + rng.uniform(0, 6, shape))
+    )
     rotations = Rotation.from_rotvec(vectors.reshape(-1, 3)).as_matrix().reshape(frames, len(names), 3, 3)
     for joint, name in enumerate(names):
         x = np.sign(rest[joint, 0])
@@ -72,7 +82,9 @@ def moved(names: tuple[str, ...], parents: np.ndarray, rest: np.ndarray, *, fram
 
 def _bends(name: str) -> str:
     bare = name.split(":")[-1].lower().removeprefix("left").removeprefix("right")
-    return {"leg": "knee", "knee": "knee", "lowerleg": "knee", "elbow": "elbow", "forearm": "elbow"}.get(bare, "")
+    return {"leg": "knee", "knee": "knee", "lowerleg": "knee", "elbow": "elbow", "forearm": "elbow"}.get(
+        bare, ""
+    )
 
 
 def in_another_pose(motion: SkeletonMotion, turns: np.ndarray) -> SkeletonMotion:

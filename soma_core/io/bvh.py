@@ -135,7 +135,9 @@ def _hierarchy(motion: SkeletonMotion, order: str, scale: float) -> Iterator[str
     depth: list[int] = []
     for joint, parent in enumerate(motion.parents):
         depth.append(0 if parent < 0 else depth[parent] + 1)
-        yield from ("  " * level + "}" for level in range(depth[joint - 1] if joint else -1, depth[joint] - 1, -1))
+        yield from (
+            "  " * level + "}" for level in range(depth[joint - 1] if joint else -1, depth[joint] - 1, -1)
+        )
         indent = "  " * depth[joint]
         offset = motion.rest[joint] - (motion.rest[parent] if parent >= 0 else 0)
         moved = "3 " if joint and joint not in motion.moves else "6 Xposition Yposition Zposition "

@@ -69,11 +69,16 @@ class SkeletonMotion:
                 got = "NaN or infinity" if np.shape(array) == shape and frames else f"shape {np.shape(array)}"
                 raise InputError(name, got=got, expected=f"finite numbers of shape {shape}",
                                  fix="Give one entry a joint and frame.")  # fmt: skip
-        if self.parents[0] != -1 or not ((self.parents[1:] >= 0) & (self.parents[1:] < np.arange(1, count))).all():
+        if (
+            self.parents[0] != -1
+            or not ((self.parents[1:] >= 0) & (self.parents[1:] < np.arange(1, count))).all()
+        ):
             raise InputError("parents", got="another order", expected="one root, parents before children",
                              fix="Sort the joints by depth.")  # fmt: skip
         if not (np.isfinite(self.fps) and self.fps > 0):
-            raise InputError("fps", got=self.fps, expected="a positive number", fix="Pass fps=30 (the true rate).")
+            raise InputError(
+                "fps", got=self.fps, expected="a positive number", fix="Pass fps=30 (the true rate)."
+            )
 
     @property
     def frame_count(self) -> int:

@@ -38,7 +38,9 @@ def read_glb_skeleton(path: Path, *, fps: float | None = None, root: str | None 
         return _glb(path, fps, root)
     except _DAMAGE as error:
         cause = f"no usable GLB ({error.__class__.__name__}: {error})"
-        raise AssetError(path, cause=cause, fix="Export one skeleton with one animation, uncompressed.") from error
+        raise AssetError(
+            path, cause=cause, fix="Export one skeleton with one animation, uncompressed."
+        ) from error
 
 
 def _glb(path: Path, fps: float | None, root: str | None) -> SkeletonMotion:
@@ -66,7 +68,12 @@ def _glb(path: Path, fps: float | None, root: str | None) -> SkeletonMotion:
     if not {"LeftForeArm", "LeftShin"} <= {*names} & {*USER_JOINTS}:
         rest = _bound(file, skins, rest)
     return skeleton_of_worlds(
-        [names[joint] for joint in order], _among(order, parents), rest[order], worlds, fps=rate, source=path.name
+        [names[joint] for joint in order],
+        _among(order, parents),
+        rest[order],
+        worlds,
+        fps=rate,
+        source=path.name,
     )
 
 
@@ -82,7 +89,9 @@ def _humanoid(extensions: dict[str, Any]) -> Iterator[tuple[int, str]]:
         yield int(bone["node"]), name.removesuffix(thumb) + renamed.get(thumb, "")
 
 
-def _under(path: Path, joints: set[int], parents: np.ndarray, names: Sequence[str], root: str | None) -> set[int]:
+def _under(
+    path: Path, joints: set[int], parents: np.ndarray, names: Sequence[str], root: str | None
+) -> set[int]:
     """Joints and what lies between them, below one node."""
     for joint in tuple(joints):
         above = int(parents[joint])
@@ -133,10 +142,14 @@ def _times(times: np.ndarray, fps: float | None) -> tuple[np.ndarray, float]:
 
 def _check_size(path: Path, size: int) -> None:
     if size > _MOST:
-        raise AssetError(path, cause=f"frames times joints are {size}, more than {_MOST}", fix="Cut it into parts.")
+        raise AssetError(
+            path, cause=f"frames times joints are {size}, more than {_MOST}", fix="Cut it into parts."
+        )
 
 
-def _glb_worlds(tracks: NodeTracks, times: np.ndarray, order: Sequence[int], count: int) -> Iterator[np.ndarray]:
+def _glb_worlds(
+    tracks: NodeTracks, times: np.ndarray, order: Sequence[int], count: int
+) -> Iterator[np.ndarray]:
     step = max(_CHUNK // (16 * max(count, 1)), 1)
     for start in range(0, len(times), step):
         yield tracks.worlds(times[start : start + step])[:, list(order)]
@@ -198,7 +211,9 @@ def _usd(path: Path, fps: float | None, root: str | None) -> SkeletonMotion:
     names = [joint.rpartition("/")[2] for joint in paths]
     parents = np.array([query.GetTopology().GetParent(index) for index in range(len(names))], int)
     if not len(names) or (parents < 0).sum() != 1 or not (parents[1:] < np.arange(1, len(names))).all():
-        raise AssetError(path, cause="its skeleton has no single root joint that comes first", fix="Export it again.")
+        raise AssetError(
+            path, cause="its skeleton has no single root joint that comes first", fix="Export it again."
+        )
     animation = query.GetAnimQuery()
     samples = np.array(animation.GetJointTransformTimeSamples() if animation else [])
     per_second = stage.GetTimeCodesPerSecond()
@@ -212,7 +227,9 @@ def _usd(path: Path, fps: float | None, root: str | None) -> SkeletonMotion:
         place.SetTime(code)
         body = np.array(place.GetLocalToWorldTransform(found[0])).T
         joints = query.ComputeJointSkelTransforms(code, still)
-        worlds[frame] = body @ np.swapaxes(np.array(joints), -1, -2)  # USD multiplies row vectors from the left
+        worlds[frame] = body @ np.swapaxes(
+            np.array(joints), -1, -2
+        )  # USD multiplies row vectors from the left
     rest = _usd_rest(query, worlds[0], np.array(place.GetLocalToWorldTransform(found[0])).T, names)
     up = "+z" if UsdGeom.GetStageUpAxis(stage) == UsdGeom.Tokens.z else "+y"
     return skeleton_of_worlds(names, parents, rest, worlds, fps=rate, source=path.name, up=up, metres=metres)

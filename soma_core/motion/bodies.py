@@ -128,7 +128,9 @@ def _smpl_body(path: Path, options: ConvertOptions, backends: FitBackends) -> Sh
         up=f"+{options.up}" if options.up else None,
     )
     _warn_lying(path, motion)
-    backend = _with_way_out(backends, motion.model, {"gender": motion.gender}, "carry=skeleton, which needs no model")
+    backend = _with_way_out(
+        backends, motion.model, {"gender": motion.gender}, "carry=skeleton, which needs no model"
+    )
     params = {"betas": _usable_betas(path, motion, backend.layer.spec, options.most_betas)}
     pose = {"rotations": motion.rotations, "translation": motion.translation}
     sequence = ModelSequence(path, backend, params, pose, fps=motion.fps, up=motion.up)

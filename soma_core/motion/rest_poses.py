@@ -6,7 +6,6 @@ import itertools
 import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 
@@ -45,7 +44,14 @@ _UPRIGHT = 0.7
 _CLOSE = np.cos(np.radians(15))
 _SAME_POSE = np.cos(np.radians(5))
 
-_NEXT = {"Shoulder": "Arm", "Arm": "ForeArm", "ForeArm": "Hand", "Leg": "Shin", "Shin": "Foot", "Foot": "ToeBase"}
+_NEXT = {
+    "Shoulder": "Arm",
+    "Arm": "ForeArm",
+    "ForeArm": "Hand",
+    "Leg": "Shin",
+    "Shin": "Foot",
+    "Foot": "ToeBase",
+}
 _KNUCKLES = ("Middle2", "Index2", "Ring2", "Pinky2")
 _AXES = {
     "+y": np.eye(3), "-y": np.diag([1.0, -1, -1]), "+z": np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]]),
@@ -110,7 +116,9 @@ def chains(source: SkeletonMotion, match: dict[str, int]) -> tuple[list[int], li
     if first in way:
         cut = way.index(first)
     else:
-        cut = max((way.index(joint) + 1 for other in ways for joint in other if joint in way), default=len(way))
+        cut = max(
+            (way.index(joint) + 1 for other in ways for joint in other if joint in way), default=len(way)
+        )
     return way[:cut], way[cut:]
 
 
@@ -149,7 +157,9 @@ def placed(source: SkeletonMotion, match: Mapping[str, int], *, unit: str | None
     up = up if up[0] in "+-" else f"+{up}"
     turn = _AXES[up]
     _warn_lying(source, turn @ _unit(_mean_trunk(source, match)), turn)
-    return Placed(source=source.placed(turn, metres, "+y"), metres=metres, up=up, turn=turn, standing=standing)
+    return Placed(
+        source=source.placed(turn, metres, "+y"), metres=metres, up=up, turn=turn, standing=standing
+    )
 
 
 def _legs_and_trunk(source: SkeletonMotion, match: Mapping[str, int]) -> tuple[np.ndarray, np.ndarray]:
@@ -392,7 +402,9 @@ class _Aligner:
         bones = [self._bones(each) if each in self._match else None for each in (first, second)]
         if bones[0] is None or bones[1] is None:
             return None
-        between = np.swapaxes(self._turns[:, self._match[first]], -1, -2) @ self._turns[:, self._match[second]]
+        between = (
+            np.swapaxes(self._turns[:, self._match[first]], -1, -2) @ self._turns[:, self._match[second]]
+        )
         axis = np.cross(_unit(bones[0][1]), between @ _unit(bones[1][1]))
         if name == second:
             axis = (np.swapaxes(between, -1, -2) @ axis[..., None])[..., 0]
@@ -456,5 +468,3 @@ def _twist(matrix: np.ndarray, axis: np.ndarray) -> float:
     moved = _shortest(turn @ axis, axis) @ turn  # what is left without the swing turns about the axis
     side = _frame(axis, np.eye(3)[np.abs(axis).argmin()])
     return float(np.arctan2((moved @ side[:, 1]) @ side[:, 2], (moved @ side[:, 1]) @ side[:, 1]))
-
-

@@ -98,7 +98,9 @@ def retarget(
     return Retargeted(motion=motion, report=report)
 
 
-def _spread(targets: tuple[str, ...], along: list[np.ndarray], hips: np.ndarray | None) -> dict[str, np.ndarray]:
+def _spread(
+    targets: tuple[str, ...], along: list[np.ndarray], hips: np.ndarray | None
+) -> dict[str, np.ndarray]:
     """Turns of a chain's joints from those of a chain of another number of joints, evenly along it."""
     if not along:
         return {}
@@ -169,5 +171,3 @@ def _length(places: np.ndarray, joints: list[list[int]]) -> float:
     """Mean length of thigh and shin together."""
     steps = [np.linalg.norm(np.diff(places[chain], axis=0), axis=1).sum() for chain in joints]
     return float(np.mean(steps))
-
-

@@ -263,7 +263,10 @@ def _scenes() -> Iterator[tuple[str, bytes]]:
 
 
 def _skeletons() -> Iterator[tuple[str, bytes]]:
-    head, end = b"HIERARCHY\nROOT Hips\n{\nOFFSET 0 0 0\nCHANNELS 1 Xrotation\n", b"MOTION\nFrames: 1\nFrame Time: 0.04\n"
+    head, end = (
+        b"HIERARCHY\nROOT Hips\n{\nOFFSET 0 0 0\nCHANNELS 1 Xrotation\n",
+        b"MOTION\nFrames: 1\nFrame Time: 0.04\n",
+    )
     joint = b"JOINT a\n{\nOFFSET 0 1 0\nCHANNELS 1 Xrotation\n"
     good = head + b"}\n" + end
     yield "bvh of a million levels", head + joint * 1_000_000 + b"}\n" * 1_000_001 + end + b"0"

@@ -70,8 +70,12 @@ def test_thirty_joints_keep_their_places(motion, rig, tmp_path):
 @pytest.mark.parametrize("rest", ["t_pose", "bind"])
 def test_joints_lie_where_the_layer_puts_them(motion, rest, tmp_path):
     layer = SomaLayer("soma", lod="low", dtype=torch.float64, kernels="torch")
-    identity = layer.identity({"shape": 1.5 * torch.randn(128, generator=torch.Generator().manual_seed(1)).double()})
-    posed = layer.pose(identity, torch.tensor(motion.rotations).double(), torch.tensor(motion.translation).double())
+    identity = layer.identity(
+        {"shape": 1.5 * torch.randn(128, generator=torch.Generator().manual_seed(1)).double()}
+    )
+    posed = layer.pose(
+        identity, torch.tensor(motion.rotations).double(), torch.tensor(motion.translation).double()
+    )
     write_bvh(motion, tmp_path / "a.bvh", rig=layer.rig, bind_world=identity.bind_world[0].numpy(), rest=rest)
     found = read_bvh(tmp_path / "a.bvh").placed(np.eye(3), 0.01)
     assert 1e3 * np.abs(found.positions() - posed.joints.numpy()).max() < LAYER_MM
@@ -99,7 +103,9 @@ LEG = "JOINT LeftUpLeg\n{\nOFFSET 10 0 0\nCHANNELS 1 Xrotation\nEnd Site\n{\nOFF
 SIX = "CHANNELS 6 Xposition Yposition Zposition Zrotation Yrotation Xrotation"
 
 
-def written(path, rows, *, root=SIX, head="Frames: 2\nFrame Time: 0.033333\n", roots=1, joint=JOINT, end="\n"):
+def written(
+    path, rows, *, root=SIX, head="Frames: 2\nFrame Time: 0.033333\n", roots=1, joint=JOINT, end="\n"
+):
     text = "HIERARCHY\n" + roots * joint.format(root=root, inner=LEG) + "MOTION\n" + head + rows
     path.write_bytes(text.replace("\n", end).encode())
     return path
@@ -120,7 +126,12 @@ def test_what_tools_write_differently_is_read(tmp_path):
     swapped = read_bvh(written(tmp_path / "d.bvh", 2 * "30 2 20 90 10 1 40\n",
                                root="CHANNELS 6 Xrotation Zposition Yrotation Yposition Zrotation Xposition"))  # fmt: skip
     assert swapped.root[0].tolist() == [1, 90, 2]
-    assert np.abs(swapped.rotations[0, 0] - Rotation.from_euler("XYZ", [30, 20, 10], degrees=True).as_matrix()).max() < 1e-12
+    assert (
+        np.abs(
+            swapped.rotations[0, 0] - Rotation.from_euler("XYZ", [30, 20, 10], degrees=True).as_matrix()
+        ).max()
+        < 1e-12
+    )
     few = read_bvh(written(tmp_path / "e.bvh", "5\n6\n", root="CHANNELS 0"))
     assert few.root[0].tolist() == [0, 90, 0]
     assert few.frame_count == 2

@@ -103,11 +103,15 @@ def test_bones_point_the_same_way(make, rig):
 
 def test_twist_comes_from_knees_and_elbows_where_bones_rest_along_axes(rig):
     plain = moved(*biped(LAFAN), seed=6)
-    upright, aligned = (soma_skeleton(retarget(each).motion, rig).turns() for each in (plain, along_axes(plain)))
+    upright, aligned = (
+        soma_skeleton(retarget(each).motion, rig).turns() for each in (plain, along_axes(plain))
+    )
     for name in ("LeftLeg", "RightShin", "LeftArm", "RightArm", "LeftForeArm"):
         joint = USER_JOINTS.index(name)
         cosine = (np.einsum("fab,fab->f", upright[:, joint], aligned[:, joint]) - 1) / 2
-        assert np.degrees(np.arccos(cosine.clip(-1, 1))).max() < 8, name  # a bent rest pose tells it otherwise
+        assert np.degrees(np.arccos(cosine.clip(-1, 1))).max() < 8, (
+            name
+        )  # a bent rest pose tells it otherwise
     assert retarget(along_axes(plain)).report["rest_pose"] == "bones along axes"
 
 
@@ -133,7 +137,11 @@ def test_a_spine_of_another_length_shares_out_its_turn(spine, rig):
 @pytest.mark.parametrize("up", ["+y", "+z", "-y"])
 def test_units_and_axes_are_told(metres, said, up, rig, caplog):
     source = mixamo_like()
-    turn = {"+y": np.eye(3), "+z": np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]]), "-y": np.diag([1.0, -1, -1])}[up]
+    turn = {
+        "+y": np.eye(3),
+        "+z": np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]]),
+        "-y": np.diag([1.0, -1, -1]),
+    }[up]
     with caplog.at_level(logging.WARNING):
         found = retarget(source.placed(turn, 1 / metres))
     meant = retarget(source)
@@ -167,15 +175,27 @@ def test_names_that_are_not_known_give_the_template_of_a_mapping(tmp_path, rig):
              "Foot": "ankle", "ToeBase": "toe"}  # fmt: skip
     for target in template:
         side = target[: len(target) - len(target.removeprefix("Left").removeprefix("Right"))]
-        part = parts[target.removeprefix(side)] if side else {"Hips": "hips", "Neck1": "neck", "Head": "head"}[target]
+        part = (
+            parts[target.removeprefix(side)]
+            if side
+            else {"Hips": "hips", "Neck1": "neck", "Head": "head"}[target]
+        )
         template[target] = strange[part].replace("*", side)
     (tmp_path / "names.yaml").write_text("".join(f"{target}: {name}\n" for target, name in template.items()))
-    done = convert_file(tmp_path / "strange.bvh", tmp_path / "out", options=ConvertOptions(mapping=str(tmp_path / "names.yaml")))
+    done = convert_file(
+        tmp_path / "strange.bvh",
+        tmp_path / "out",
+        options=ConvertOptions(mapping=str(tmp_path / "names.yaml")),
+    )
     assert done.report["spine"] == strange["spine"].split()
     assert bones_apart(source, retarget(source, mapping=template), rig)["LeftShin"] < SAME_DEGREES
     (tmp_path / "names.json").write_text(json.dumps(template | {"LeftLeg": "nobody"}))
     with pytest.raises(InputError, match="mapping: nobody"):
-        convert_file(tmp_path / "strange.bvh", tmp_path / "out", options=ConvertOptions(mapping=str(tmp_path / "names.json")))
+        convert_file(
+            tmp_path / "strange.bvh",
+            tmp_path / "out",
+            options=ConvertOptions(mapping=str(tmp_path / "names.json")),
+        )
 
 
 def test_what_is_not_carried_over_is_listed(tmp_path):
