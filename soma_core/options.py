@@ -22,6 +22,8 @@ __all__ = [
     "BvhChoice",
     "BvhRest",
     "Contacts",
+    "BoneMatch",
+    "Carry",
     "ConvertResult",
     "EulerOrder",
     "FitLod",
@@ -67,6 +69,20 @@ class Contacts(StrEnum):
 
     free = "free"
     lock = "lock"
+
+
+class BoneMatch(StrEnum):
+    """Which bones of another skeleton are matched by direction; the others keep their turn since rest."""
+
+    bones = "bones"
+    limbs = "limbs"
+
+
+class Carry(StrEnum):
+    """How a motion of a model comes over: its body is fitted, or its joints are carried."""
+
+    fit = "fit"
+    skeleton = "skeleton"
 
 
 class ConvertResult(StrEnum):

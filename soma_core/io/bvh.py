@@ -111,16 +111,19 @@ def _depth_first(motion: SkeletonMotion) -> SkeletonMotion:
 
 
 def _write(motion: SkeletonMotion, path: Path, order: str, scale: float) -> None:
-    motion, columns = _depth_first(motion), []
+    motion, columns, formats = _depth_first(motion), [], []
+    place = f"%.{7 + round(2 - np.log10(scale))}f"  # to the nanometre
     for joint in range(len(motion.names)):
         if joint == 0 or joint in motion.moves:
             columns.append(scale * (motion.moves[joint] if joint else motion.root))
+            formats += [place] * 3
         columns.append(np.degrees(euler_from_matrices(motion.rotations[:, joint], order)))
+        formats += ["%.7f"] * 3
     with open(path, "w", encoding="utf-8", newline="\n") as stream:
         stream.write("HIERARCHY\n")
         stream.writelines(f"{line}\n" for line in _hierarchy(motion, order, scale))
         stream.write(f"MOTION\nFrames: {motion.frame_count}\nFrame Time: {1 / motion.fps:.9g}\n")
-        row = " ".join(["%.7f"] * sum(column.shape[1] for column in columns)) + "\n"
+        row = " ".join(formats) + "\n"
         for start in range(0, motion.frame_count, _ROWS):
             block = np.concatenate([column[start : start + _ROWS] for column in columns], axis=1)
             stream.writelines(row % tuple(values) for values in block.tolist())
@@ -132,7 +135,9 @@ def _hierarchy(motion: SkeletonMotion, order: str, scale: float) -> Iterator[str
     depth: list[int] = []
     for joint, parent in enumerate(motion.parents):
         depth.append(0 if parent < 0 else depth[parent] + 1)
-        yield from ("  " * level + "}" for level in range(depth[joint - 1] if joint else -1, depth[joint] - 1, -1))
+        yield from (
+            "  " * level + "}" for level in range(depth[joint - 1] if joint else -1, depth[joint] - 1, -1)
+        )
         indent = "  " * depth[joint]
         offset = motion.rest[joint] - (motion.rest[parent] if parent >= 0 else 0)
         moved = "3 " if joint and joint not in motion.moves else "6 Xposition Yposition Zposition "

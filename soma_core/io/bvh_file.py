@@ -28,7 +28,26 @@ _WORD = re.compile(
     rb"|(?i:^[ \t]*(MOTION)\b)|([{}])|(?:\#|//)[^\r\n]*|(\S+)", re.MULTILINE,
 )  # fmt: skip
 _HEAD = re.compile(rb"(?i:Frames[ \t]*:?[ \t]*(\S+))|(?i:Frame[ \t]*Time[ \t]*:?[ \t]*(\S+))")
-_RATES = (24, 25, 30, 48, 50, 60, 72, 90, 100, 120, 144, 150, 180, 200, 240, 24 / 1.001, 30 / 1.001, 60 / 1.001)
+_RATES = (
+    24,
+    25,
+    30,
+    48,
+    50,
+    60,
+    72,
+    90,
+    100,
+    120,
+    144,
+    150,
+    180,
+    200,
+    240,
+    24 / 1.001,
+    30 / 1.001,
+    60 / 1.001,
+)
 _FIX = "Export it again as BVH, with HIERARCHY and MOTION."
 
 
@@ -62,12 +81,14 @@ def read_bvh(path: str | Path, *, fps: float | None = None, root: str | None = N
     refuse_unreadable(path)
     with open(path, "rb") as stream, mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ) as text:
         tree, at = _hierarchy(path, text)
-        announced, frame_time, at = _motion_head(path, text, at)
+        announced, frame_time, at = _motion_head(text, at)
         rate = _frame_rate(path, frame_time, fps)
         width = sum(map(len, tree.channels))
         values = _numbers(path, text, at)
     if not width or len(values) < width:
-        raise AssetError(path, cause=f"holds {len(values)} numbers for {width} channels: no whole frame", fix=_FIX)
+        raise AssetError(
+            path, cause=f"holds {len(values)} numbers for {width} channels: no whole frame", fix=_FIX
+        )
     frames = len(values) // width
     if announced != str(frames) or len(values) % width:
         cut = f" and {len(values) % width} of the {width} numbers of another" if len(values) % width else ""
@@ -93,7 +114,12 @@ def _hierarchy(path: Path, text: mmap.mmap) -> tuple[_Tree, int]:
             return tree, word.end()
         if kind:
             pending = len(tree.names)
-            _add_joint(path, tree, name.decode("utf-8", "replace").strip(), -1 if kind.upper() == b"ROOT" else stack[-1])
+            _add_joint(
+                path,
+                tree,
+                name.decode("utf-8", "replace").strip(),
+                -1 if kind.upper() == b"ROOT" else stack[-1],
+            )
         elif end:
             pending = -2
         elif brace == b"{":
@@ -115,7 +141,9 @@ def _hierarchy(path: Path, text: mmap.mmap) -> tuple[_Tree, int]:
 
 def _add_joint(path: Path, tree: _Tree, name: str, parent: int) -> None:
     if len(tree.names) >= _MOST_JOINTS or parent < -1:
-        cause = f"more than {_MOST_JOINTS} joints" if parent >= -1 else f"the joint {name!r} lies below no joint"
+        cause = (
+            f"more than {_MOST_JOINTS} joints" if parent >= -1 else f"the joint {name!r} lies below no joint"
+        )
         raise AssetError(path, cause=cause, fix="Export the skeleton of one body.")
     tree.names.append(name)
     tree.parents.append(parent)
@@ -140,13 +168,17 @@ def _add_entry(path: Path, tree: _Tree, stack: list[int], entry: bytes, text: by
         names = [word.decode("ascii", "replace").lower() for word in words[1:]]
         if int(words[0]) != len(names):
             raise ValueError(f"CHANNELS {words[0].decode('ascii', 'replace')[:9]} with {len(names)} names")
-        tree.channels[joint] = [("xyz".index(name[0]), {"rotation": True, "position": False}[name[1:]]) for name in names]
+        tree.channels[joint] = [
+            ("xyz".index(name[0]), {"rotation": True, "position": False}[name[1:]]) for name in names
+        ]
     except (ValueError, IndexError, KeyError) as error:
         cause = f"unreadable {entry.decode()} of {tree.names[joint] if joint >= 0 else 'an end'!r} ({error})"
-        raise AssetError(path, cause=cause, fix="Correct the line: x y z, or a count and Xposition ... Zrotation.") from error
+        raise AssetError(
+            path, cause=cause, fix="Correct the line: x y z, or a count and Xposition ... Zrotation."
+        ) from error
 
 
-def _motion_head(path: Path, text: mmap.mmap, at: int) -> tuple[str, str | None, int]:
+def _motion_head(text: mmap.mmap, at: int) -> tuple[str, str | None, int]:
     """Frames that are announced, the frame time as text, and where the numbers begin."""
     announced, frame_time = "no", None
     for _ in range(2):
@@ -204,7 +236,9 @@ def _parsed(path: Path, piece: bytes) -> np.ndarray:
         return np.empty(0)
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("error")  # numpy 2.4 warns where a text is none, and returns what came before
+            warnings.simplefilter(
+                "error"
+            )  # numpy 2.4 warns where a text is none, and returns what came before
             values = np.fromstring(piece.decode("ascii"), sep=" ")
         if np.isfinite(values).all():
             return values

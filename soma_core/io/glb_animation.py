@@ -77,6 +77,11 @@ class NodeTracks:
         """Times [s] of the track with the most keys; empty without an animation."""
         return max((track.times for track in self._tracks.values()), key=len, default=np.empty(0))
 
+    @property
+    def turning(self) -> bool:
+        """Whether the rotation of a node is animated."""
+        return any(path == "rotation" for _, path in self._tracks)
+
     def moves(self, node: int) -> bool:
         """Whether the morph weights of a node are animated."""
         return (node, "weights") in self._tracks

@@ -40,7 +40,11 @@ _MOST_BYTES = 1 << 20
 
 
 def match_joints(
-    names: Sequence[str], parents: np.ndarray, *, mapping: Mapping[str, str] | None = None, source: str = "names"
+    names: Sequence[str],
+    parents: np.ndarray,
+    *,
+    mapping: Mapping[str, str] | None = None,
+    source: str = "names",
 ) -> dict[str, int]:
     """Find the joints of this skeleton among those of another.
 
@@ -92,8 +96,12 @@ def read_mapping(path: str | Path) -> dict[str, str]:
     try:
         found = yaml.safe_load(path.read_text(encoding="utf-8"))
     except (yaml.YAMLError, UnicodeDecodeError, RecursionError, ValueError) as error:
-        raise AssetError(path, cause="neither JSON nor YAML", fix="Write JOINT: NAME on each line.") from error
-    if not isinstance(found, dict) or not all(isinstance(text, str) for pair in found.items() for text in pair):
+        raise AssetError(
+            path, cause="neither JSON nor YAML", fix="Write JOINT: NAME on each line."
+        ) from error
+    if not isinstance(found, dict) or not all(
+        isinstance(text, str) for pair in found.items() for text in pair
+    ):
         raise InputError(str(path), got=type(found).__name__, expected="names, one for each joint here",
                          fix="Write JOINT: NAME on each line.")  # fmt: skip
     strange = sorted(set(found) - set(USER_JOINTS))

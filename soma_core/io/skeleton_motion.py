@@ -6,20 +6,23 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from soma_core.errors import InputError
 from soma_core.io.motion import Motion
 from soma_core.rig.skeleton import Rig
 
-__all__ = ["SkeletonMotion", "soma_skeleton"]
+__all__ = ["SkeletonMotion", "skeleton_of_worlds", "soma_skeleton"]
 
 _RIGID = 1e-8
 """Change of a bone [m] that counts as rounding of double precision."""
 
+_FLAT = 1e-18
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class SkeletonMotion:
-    """Joints over time; metres, column vectors.
+    """Joints over time; column vectors, metres unless said otherwise.
 
     Rotations are relative to the rest pose, in world axes at rest: identity everywhere is the rest pose, and
     ``turns = rotations[root] @ ... @ rotations[j]`` takes joint j and its bones from rest to the frame,
@@ -35,7 +38,8 @@ class SkeletonMotion:
         ends: (J, 3) from a joint to the end of its bone at rest [m], where the file tells; else NaN.
         moves: index of a joint -> (frames, 3) from its parent to it, in the parent's axes at rest [m]; for
             bones that change.
-        up: upward axis of the world.
+        up: upward axis of the world, where the file tells.
+        metres: length of the unit [m], where the file tells.
         source: where it came from.
 
     Raises:
@@ -50,7 +54,8 @@ class SkeletonMotion:
     fps: float
     ends: np.ndarray | None = None
     moves: Mapping[int, np.ndarray] = field(default_factory=dict)
-    up: str = "+y"
+    up: str | None = None
+    metres: float | None = None
     source: str = ""
 
     def __post_init__(self) -> None:
@@ -64,11 +69,16 @@ class SkeletonMotion:
                 got = "NaN or infinity" if np.shape(array) == shape and frames else f"shape {np.shape(array)}"
                 raise InputError(name, got=got, expected=f"finite numbers of shape {shape}",
                                  fix="Give one entry a joint and frame.")  # fmt: skip
-        if self.parents[0] != -1 or not ((self.parents[1:] >= 0) & (self.parents[1:] < np.arange(1, count))).all():
+        if (
+            self.parents[0] != -1
+            or not ((self.parents[1:] >= 0) & (self.parents[1:] < np.arange(1, count))).all()
+        ):
             raise InputError("parents", got="another order", expected="one root, parents before children",
                              fix="Sort the joints by depth.")  # fmt: skip
         if not (np.isfinite(self.fps) and self.fps > 0):
-            raise InputError("fps", got=self.fps, expected="a positive number", fix="Pass fps=30 (the true rate).")
+            raise InputError(
+                "fps", got=self.fps, expected="a positive number", fix="Pass fps=30 (the true rate)."
+            )
 
     @property
     def frame_count(self) -> int:
@@ -106,6 +116,7 @@ class SkeletonMotion:
             moves={joint: bone @ scaled for joint, bone in self.moves.items()},
             rotations=turn @ self.rotations @ turn.T,
             up=up or self.up,
+            metres=None if self.metres is None else self.metres / metres,
         )
 
     def rebased(self, rest: np.ndarray, turns: np.ndarray) -> SkeletonMotion:
@@ -147,20 +158,29 @@ class SkeletonMotion:
         turns = self.turns()
         positions = self.positions(turns)[:, kept]
         turns, rest = turns[:, kept], self.rest[kept]
-        rotations, moves = turns.copy(), {}
-        for joint, parent in enumerate(parents):
-            if parent < 0:
-                continue
-            back = np.swapaxes(turns[:, parent], -1, -2)
-            rotations[:, joint] = back @ turns[:, joint]
-            bone = (back @ (positions[:, joint] - positions[:, parent])[..., None])[..., 0]
-            if np.abs(bone - (rest[joint] - rest[parent])).max() > _RIGID:
-                moves[joint] = bone
+        rotations, moves = _relative(turns, positions, rest, parents)
         return replace(
             self, names=tuple(self.names[joint] for joint in kept), parents=np.array(parents), rest=rest,
             rotations=rotations, root=positions[:, 0], moves=moves,
             ends=None if self.ends is None else self.ends[kept],
         )  # fmt: skip
+
+
+def _relative(
+    turns: np.ndarray, positions: np.ndarray, rest: np.ndarray, parents: Sequence[int] | np.ndarray
+) -> tuple[np.ndarray, dict[int, np.ndarray]]:
+    """Rotations relative to the parent, and bones that change, of turns and positions in the world."""
+    rotations, moves = turns.copy(), {}
+    size = _RIGID * max(1.0, float(np.abs(positions).max()))
+    for joint, parent in enumerate(parents):
+        if parent < 0:
+            continue
+        back = np.swapaxes(turns[:, parent], -1, -2)
+        rotations[:, joint] = back @ turns[:, joint]
+        bone = (back @ (positions[:, joint] - positions[:, parent])[..., None])[..., 0]
+        if np.abs(bone - (rest[joint] - rest[parent])).max() > size:
+            moves[joint] = bone
+    return rotations, moves
 
 
 def soma_skeleton(motion: Motion, rig: Rig, bind_world: np.ndarray | None = None) -> SkeletonMotion:
@@ -179,11 +199,59 @@ def soma_skeleton(motion: Motion, rig: Rig, bind_world: np.ndarray | None = None
         parent = parents[joint]
         bone = bind[parent, :3, :3].T @ (bind[joint, :3, 3] - bind[parent, :3, 3])
         rest[joint] = rest[parent] + orient[parent] @ bone
-    rotations = motion.rotations.astype(np.float64)
+    # Single precision leaves matrices near SO(3), and products down the tree would add that up.
+    rotations = Rotation.from_matrix(motion.rotations.reshape(-1, 3, 3)).as_matrix().reshape(-1, 77, 3, 3)
     if motion.convention == "absolute_local":
         above = np.concatenate([np.eye(3)[None], orient[parents[2:]]])
         rotations = above @ rotations @ np.swapaxes(orient[1:], -1, -2)
     return SkeletonMotion(
         names=motion.joint_names, parents=np.maximum(parents[1:] - 1, -1), rest=rest[1:], rotations=rotations,
-        root=motion.translation.astype(np.float64), fps=motion.fps, source=motion.source,
+        root=motion.translation.astype(np.float64), fps=motion.fps, up="+y", metres=1.0,
+        source=motion.source,
     )  # fmt: skip
+
+
+def skeleton_of_worlds(
+    names: Sequence[str],
+    parents: np.ndarray,
+    rest: np.ndarray,
+    worlds: np.ndarray,
+    *,
+    fps: float,
+    source: str,
+    up: str = "+y",
+    metres: float = 1.0,
+) -> SkeletonMotion:
+    """A motion from world transforms; scales are left out, whatever they are.
+
+    Args:
+        names: of the joints, parents first.
+        parents: (J,) -1 for the root.
+        rest: (J, 4, 4) world transforms in the rest pose.
+        worlds: (frames, J, 4, 4) world transforms.
+        fps: frames per second.
+        source: where it came from.
+        up: upward axis of the world.
+        metres: length of the unit.
+    """
+    turns = _rotations(worlds) @ np.swapaxes(_rotations(rest), -1, -2)
+    rotations, moves = _relative(turns, worlds[..., :3, 3], rest[:, :3, 3], parents)
+    return SkeletonMotion(
+        names=tuple(names), parents=np.asarray(parents), rest=rest[:, :3, 3].copy(), rotations=rotations,
+        root=worlds[:, 0, :3, 3].copy(), fps=fps, moves=moves, up=up, metres=metres,
+        source=source,
+    )  # fmt: skip
+
+
+def _rotations(transforms: np.ndarray) -> np.ndarray:
+    """Nearest rotations of transforms (..., 4, 4); float32 and scales leave them near, not at rotations.
+
+    Raises:
+        ValueError: a transform that is flat, or no numbers.
+    """
+    linear = transforms[..., :3, :3].reshape(-1, 3, 3).astype(np.float64)
+    if not np.isfinite(transforms).all() or (np.abs(np.linalg.det(linear)) < _FLAT).any():
+        raise ValueError("a joint has no size, or no numbers")
+    lengths = np.linalg.norm(linear, axis=1, keepdims=True)
+    turns = Rotation.from_matrix(linear / lengths * np.sign(np.linalg.det(linear))[:, None, None])
+    return np.asarray(turns.as_matrix().reshape(*transforms.shape[:-2], 3, 3))

@@ -128,7 +128,9 @@ def _smpl_body(path: Path, options: ConvertOptions, backends: FitBackends) -> Sh
         up=f"+{options.up}" if options.up else None,
     )
     _warn_lying(path, motion)
-    backend = backends.get(motion.model, {"gender": motion.gender})
+    backend = _with_way_out(
+        backends, motion.model, {"gender": motion.gender}, "carry=skeleton, which needs no model"
+    )
     params = {"betas": _usable_betas(path, motion, backend.layer.spec, options.most_betas)}
     pose = {"rotations": motion.rotations, "translation": motion.translation}
     sequence = ModelSequence(path, backend, params, pose, fps=motion.fps, up=motion.up)
@@ -225,10 +227,20 @@ def _known_mhr(
     """The user's MHR model, and the body that the file describes."""
     chosen = options.backend
     own = chosen.options if chosen is not None and chosen.name == _MHR else {}
+    backend = _with_way_out(backends, _MHR, own, "identity=unknown, which needs the wrap pair alone")
+    return backend, _mhr_params(frames)
+
+
+def _with_way_out(backends: FitBackends, name: str, options: Mapping[str, Any], other: str) -> FitBackend:
+    """A backend, or the refusal with another way to go.
+
+    Raises:
+        BackendError: it cannot be used.
+    """
     try:
-        return backends.get(_MHR, own), _mhr_params(frames)
+        return backends.get(name, options)
     except BackendError as error:
-        fix = f"{error.fix.rstrip('.')}. Or pass identity=unknown, which needs the wrap pair alone"
+        fix = f"{error.fix.rstrip('.')}. Or pass {other}"
         raise BrokenBackendError(who=error.who, stage=error.stage, cause=error.cause, fix=fix) from error
 
 

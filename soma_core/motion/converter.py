@@ -14,6 +14,7 @@ from soma_core.errors import InputError, SomaError
 from soma_core.io.motion import Motion
 from soma_core.io.motion_files import read_motion
 from soma_core.motion.bodies import FITTED, open_body
+from soma_core.motion.carried import carried, check_carried
 from soma_core.motion.chunks import refuse_other_settings
 from soma_core.motion.files import Layout, ResultFiles, layout_of, read, write
 from soma_core.motion.fit_job import FitJob, FitPlan, fit_settings, plan_body
@@ -96,9 +97,14 @@ class Converter:
         """
         before = _products_before(files.report)
         layout = _known_layout(path)
-        fitted = layout in FITTED
-        if fitted:
-            _refuse_chosen(path, self._options)
+        options = self._options
+        check_carried(path, layout, options)
+        retargeted = layout == "skeleton" or (layout == "amass" and options.carry == "skeleton")
+        fitted = layout in FITTED and not retargeted
+        if retargeted:
+            found = _retargeted(path, layout, options, files)
+        elif fitted:
+            _refuse_chosen(path, options)
             found = self._fitted(path, layout, files, chunks)
         else:
             found = self._carry_over(path, layout, files)
@@ -158,6 +164,17 @@ def _refuse_chosen(path: Path, options: ConvertOptions) -> None:
         )  # fmt: skip
 
 
+def _retargeted(path: Path, layout: Layout, options: ConvertOptions, files: ResultFiles) -> Converted:
+    """Write the motion of another skeleton, and what became of each of its joints."""
+    found = carried(path, layout, options)
+    write(found.motion, files.motion)
+    settings = {"input": str(path.resolve()), "layout": layout, "fps": found.motion.fps}
+    report = {"settings": settings, "frames": found.motion.frame_count, "identity": None,
+              "rotations": "carried over by the skeleton", **found.report}  # fmt: skip
+    atomic_text(files.report, json.dumps(report, indent=2) + "\n")
+    return Converted(report=report, files=files)
+
+
 def _known_layout(path: Path) -> Layout:
     """Layout of a file that must hold a motion.
 
@@ -169,7 +186,7 @@ def _known_layout(path: Path) -> Layout:
         raise InputError(
             str(path),
             got="no motion under any key that is known",
-            expected="the keys of an AMASS, SAM 3D Body, kimodo or SOMA file",
+            expected="the keys of an AMASS, SAM 3D Body, kimodo or SOMA file, or a skeleton as BVH, GLB or USD",
             fix="Vertices over time are what soma invert takes.",
         )
     return layout

@@ -14,6 +14,7 @@ from soma_core.io.motion import Motion
 from soma_core.io.motion_files import read_motion, write_motion
 from soma_core.io.npz_fields import open_npz
 from soma_core.io.sam3d import SAM3D_SUFFIXES
+from soma_core.io.skeleton_files import SKELETON_SUFFIXES
 from soma_core.io.soma_npz import METRES_PER_UNIT
 from soma_core.motion.writers import WRITERS
 from soma_core.options import LengthUnit, Product
@@ -22,9 +23,9 @@ from soma_core.topology.frames import METRES
 
 __all__ = ["SUFFIXES", "Layout", "ResultFiles", "fingerprint", "layout_of", "read", "write"]
 
-Layout = Literal["soma", "kimodo", "amass", "sam3d"]
+Layout = Literal["soma", "kimodo", "amass", "sam3d", "skeleton"]
 
-SUFFIXES = SAM3D_SUFFIXES
+SUFFIXES = (*SAM3D_SUFFIXES, *SKELETON_SUFFIXES)
 """Files that may hold a motion."""
 
 
@@ -83,6 +84,8 @@ def layout_of(path: str | Path) -> Layout | None:
     path = Path(path).expanduser()
     if path.suffix.lower() == ".parquet":
         return "sam3d"
+    if path.suffix.lower() in SKELETON_SUFFIXES:
+        return "skeleton"
     with open_npz(path) as fields:
         if "global_rot_mats" in fields or "local_rot_mats" in fields:
             return "kimodo"

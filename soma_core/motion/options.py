@@ -10,6 +10,8 @@ from soma_core.options import (
     BackendChoice,
     BodyGender,
     Contacts,
+    BoneMatch,
+    Carry,
     ConvertResult,
     FitLod,
     Ground,
@@ -104,10 +106,19 @@ class ConvertOptions(WriteOptions, FitOptions):
         translation: where the body stands, on the way back and in what is written of a body.
         ground: what lies on the floor then; None: the usual for that translation.
         contacts: whether feet that stand are pinned then.
+        carry: for models of the SMPL family: ``skeleton`` needs no model file, and reads no betas.
+        mapping: file that says which joint of a skeleton is which, where its names are not known.
+        root: of a file with several skeletons, the one that is read.
+        match: which bones of another skeleton are matched by direction: ``bones`` all, ``limbs`` those of
+            arms, legs and fingers; None: all, but for the SMPL family the limbs.
     """
 
     to: str = "soma"
     write: list[Product] | None = None
+    carry: Carry = Carry.fit
+    mapping: str | None = None
+    root: str | None = None
+    match: BoneMatch | None = None
     result: ConvertResult | None = None
     gender: BodyGender | None = None
     most_betas: int | None = None

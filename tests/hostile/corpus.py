@@ -262,6 +262,34 @@ def _scenes() -> Iterator[tuple[str, bytes]]:
     yield "usdc of nothing", b"PXR-USDC" + bytes(100)
 
 
+def _skeletons() -> Iterator[tuple[str, bytes]]:
+    head, end = (
+        b"HIERARCHY\nROOT Hips\n{\nOFFSET 0 0 0\nCHANNELS 1 Xrotation\n",
+        b"MOTION\nFrames: 1\nFrame Time: 0.04\n",
+    )
+    joint = b"JOINT a\n{\nOFFSET 0 1 0\nCHANNELS 1 Xrotation\n"
+    good = head + b"}\n" + end
+    yield "bvh of a million levels", head + joint * 1_000_000 + b"}\n" * 1_000_001 + end + b"0"
+    yield "bvh of a million joints", head + (joint + b"}\n") * 1_000_000 + b"}\n" + end + b"0"
+    yield "bvh of a million brackets", head + b"{" * 1_000_000 + b"}" * 1_000_001 + end + b"0"
+    yield "bvh of a missing bracket", head + joint + b"}\n" + end + b"0 0"
+    yield "bvh of a bracket too many", head + b"}\n}\n" + end + b"0"
+    yield "bvh of a billion frames", good.replace(b"Frames: 1", b"Frames: 1000000000") + b"0"
+    yield "bvh of no frame", good
+    yield "bvh of NaN", good + b"nan"
+    yield "bvh of infinity", good + b"1e999"
+    yield "bvh of text", good + b"0 1,5"
+    yield "bvh of one long number", good + b"1" * 2_000_000
+    yield "bvh of many channels", good.replace(b"1 Xrotation", b"1000000000 Xrotation") + b"0"
+    yield "bvh of an unknown channel", good.replace(b"Xrotation", b"Wrotation") + b"0"
+    yield "bvh of an offset of NaN", good.replace(b"0 0 0", b"0 nan 0") + b"0"
+    yield "bvh of no motion", head + b"}\n"
+    yield "bvh of an end alone", b"HIERARCHY\nEnd Site\n{\nOFFSET 0 0 0\n}\n" + end
+    yield "bvh of a joint without a root", b"HIERARCHY\n" + joint + b"}\n" + end + b"0"
+    yield "bvh of entries before a joint", b"HIERARCHY\nOFFSET 0 0 0\nCHANNELS 1 Xrotation\n" + end
+    yield "bvh of no frame time", good.replace(b"0.04", b"0") + b"0"
+
+
 def _plain() -> Iterator[tuple[str, bytes]]:
     yield "empty file", b""
     yield (
@@ -282,7 +310,7 @@ def _plain() -> Iterator[tuple[str, bytes]]:
 
 def _all() -> dict[str, bytes | Callable[[], bytes]]:
     found: dict[str, bytes | Callable[[], bytes]] = {"npz bomb": _bomb}
-    for part in (_plain, _pickles, _structured_pickles, _arrays, _archives, _meshes, _scenes):
+    for part in (_plain, _pickles, _structured_pickles, _arrays, _archives, _meshes, _scenes, _skeletons):
         found.update(part())
     return found
 

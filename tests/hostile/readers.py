@@ -20,6 +20,7 @@ from soma_core.io import open_vertex_sequence, read_amass, read_motion
 from soma_core.io.mesh_vertices import read_mesh_vertices
 from soma_core.io.pickled_arrays import read_pickled_arrays
 from soma_core.io.sam3d import read_sam3d
+from soma_core.io.skeleton_files import read_skeleton
 from soma_core.obj import read_obj
 from soma_core.rig.manifest import MANIFEST_NAME, read_manifest
 from soma_core.rig.neutral import load_shape_space, read_topology
@@ -131,6 +132,11 @@ def _glb(path: Path) -> None:
     path.write_bytes(glb_bytes(document, data))
 
 
+def _joints_glb(path: Path) -> None:
+    nodes = [{"name": "Hips", "children": [1]}, {"name": "LeftLeg", "translation": [0, -1, 0]}]
+    path.write_bytes(glb_bytes({"asset": {"version": "2.0"}, "nodes": nodes, "skins": [{"joints": [0, 1]}]}))
+
+
 def glb_bytes(document: object, data: bytes = b"") -> bytes:
     """A GLB of a JSON document and a binary chunk."""
     text = (document if isinstance(document, str) else json.dumps(document)).encode()
@@ -187,6 +193,12 @@ def _usd(path: Path) -> None:
     path.write_text(USD)
 
 
+def _bvh(path: Path) -> None:
+    head = "HIERARCHY\nROOT Hips\n{\n OFFSET 0 0 0\n CHANNELS 6 Xposition Yposition Zposition Zrotation Yrotation "
+    leg = "Xrotation\n JOINT LeftLeg\n {\n  OFFSET 0 -40 0\n  CHANNELS 1 Xrotation\n  End Site\n  {\n   OFFSET 0 -40 0\n  }"
+    path.write_text(f"{head}{leg}\n }}\n}}\nMOTION\nFrames: 2\nFrame Time: 0.04\n" + "0 90 0 1 2 3 4\n" * 2)
+
+
 def _json(path: Path) -> None:
     path.write_text(json.dumps({"schema": 1, "rig_hash": "a", "rig_revision": "b", "files": {}}))
 
@@ -225,6 +237,17 @@ READERS = [
     ),
     Reader(name="vertices usdc", suffix=".usdc", read=_frames),
     Reader(name="vertices usdz", suffix=".usdz", read=_frames),
+    Reader(name="bvh", suffix=".bvh", read=read_skeleton, good=_bvh,
+           accepts=("bvh of a billion frames", "bvh of a joint without a root")),
+    Reader(name="joints of a glb", suffix=".glb", read=read_skeleton, good=_joints_glb),
+    Reader(
+        name="joints of a usd", suffix=".usda", read=read_skeleton, good=_usd,
+        accepts=(
+            "usda of joint indices out of range", "usda of negative joint indices", "usda of faces out of range",
+            "usda of negative faces", "usda of negative face counts", "usda of weights of NaN",
+            "usda of points of NaN", "usda of a huge element size", "usda of an element size of zero",
+        ),
+    ),
     Reader(name="motion", suffix=".npz", read=read_motion, good=_motion),
     Reader(name="kimodo motion", suffix=".npz", read=read_motion, good=_kimodo),
     Reader(name="amass motion", suffix=".npz", read=read_amass, good=_amass),

@@ -22,7 +22,7 @@ FOR_ALL = (
 
 def files_for(reader):
     """Hostile files of the reader's own format, those of no format, and some of others."""
-    kinds = {*KINDS.values(), "npz", "obj", "ply", "glb", "usda", "usdc"} - {
+    kinds = {*KINDS.values(), "npz", "obj", "ply", "glb", "usda", "usdc", "bvh"} - {
         KINDS.get(reader.suffix, reader.suffix[1:])
     }
     return [name for name in FILES if name in FOR_ALL or name.partition(" ")[0] not in kinds]

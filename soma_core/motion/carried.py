@@ -1,0 +1,72 @@
+"""Motions that come over by their joints: skeletons of other tools, and SMPL's without its model."""
+
+from __future__ import annotations
+
+import logging
+from pathlib import Path
+
+import numpy as np
+
+from soma_core.errors import InputError
+from soma_core.io.amass import read_amass
+from soma_core.io.joint_names import read_mapping
+from soma_core.io.skeleton_files import read_skeleton
+from soma_core.io.smpl_skeleton import smpl_skeleton
+from soma_core.motion.options import ConvertOptions
+from soma_core.motion.retarget import Retargeted, retarget
+from soma_core.options import BoneMatch
+from soma_core.rig import load_canonical
+
+__all__ = ["carried", "check_carried"]
+
+_log = logging.getLogger(__name__)
+
+_SHOWN = 12
+
+
+def check_carried(path: Path, layout: str, options: ConvertOptions) -> None:
+    """Refuse settings of skeletons for other files, and those of fits for skeletons.
+
+    Raises:
+        InputError: a setting that would change nothing.
+    """
+    skeleton = layout == "skeleton"
+    joints = skeleton or (layout == "amass" and options.carry == "skeleton")
+    unused = {
+        "carry": options.carry if options.carry != "fit" and layout != "amass" else None,
+        "mapping": None if skeleton else options.mapping, "root": None if skeleton else options.root,
+        "match": None if joints else options.match,
+        "gender": options.gender if skeleton else None, "most_betas": options.most_betas if joints else None,
+    }  # fmt: skip
+    for name, value in unused.items():
+        if value is not None:
+            raise InputError(name, got=str(value), expected=f"none for {path.name}, whose layout is {layout}",
+                             fix=f"Leave {name} out.")  # fmt: skip
+
+
+def carried(path: Path, layout: str, options: ConvertOptions) -> Retargeted:
+    """Read the skeleton of a file and carry its motion over to this one.
+
+    Raises:
+        SomaError: the file cannot be read, or its joints are not known.
+    """
+    up, match = str(options.up) if options.up else None, options.match
+    if layout == "amass":
+        motion = read_amass(path, fps=options.fps, gender="neutral", up=f"+{up}" if up else None)  # type: ignore[arg-type]
+        if np.any(motion.betas):
+            _log.warning("%s: betas are not read: joints are carried over, no body is fitted", path.name)
+        source, up, match = smpl_skeleton(motion, load_canonical("mid")[1]), None, match or BoneMatch.limbs
+    else:
+        source = read_skeleton(path, fps=options.fps, root=options.root)
+    mapping = read_mapping(options.mapping) if options.mapping else None
+    found = retarget(source, mapping=mapping, unit=str(options.unit) if options.unit else None, up=up,
+                     match=str(match or BoneMatch.bones))  # fmt: skip
+    left = found.report["not_carried"]
+    if left:
+        more = " ..." if len(left) > _SHOWN else ""
+        _log.info("%s: not carried over: %s%s", path.name, ", ".join(left[:_SHOWN]), more)
+    scale = found.report["path_scale"]
+    if scale != 1:
+        _log.info("%s: its legs are %.3f m; the path is scaled by %.3f to those of the rig, %.3f m",
+                  path.name, found.report["legs_metres"], scale, scale * found.report["legs_metres"])  # fmt: skip
+    return found

@@ -1,0 +1,225 @@
+"""Motions of other skeletons: bones point the same way here, whatever the names, lengths and rest poses."""
+
+from __future__ import annotations
+
+import json
+import logging
+import re
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from soma_core import load_canonical
+from soma_core.errors import InputError
+from soma_core.io.bvh import write_bvh
+from soma_core.io.joint_order import PARENT_NAMES, USER_JOINTS
+from soma_core.io.skeleton_motion import soma_skeleton
+from soma_core.motion import ConvertOptions, convert_file
+from soma_core.motion.retarget import retarget
+from tests.skeletons import along_axes, biped, in_another_pose, moved
+
+SAME_DEGREES = 0.05  # float32 rotations and seven decimals of a file; half a degree is what is asked
+
+LAFAN = {
+    "hips": "Hips", "spine": "Spine Spine1 Spine2", "neck": "Neck", "head": "Head", "collar": "*Shoulder", "arm": "*Arm",
+    "elbow": "*ForeArm", "wrist": "*Hand", "thigh": "*UpLeg", "knee": "*Leg", "ankle": "*Foot", "toe": "*Toe",
+    "finger1": "*HandMiddle1", "finger2": "*HandMiddle2",
+}  # fmt: skip
+MIXAMO = {part: " ".join(f"mixamorig:{name}" for name in names.split()) for part, names in LAFAN.items()}
+MIXAMO["toe"] = "mixamorig:*ToeBase"
+XSENS = {
+    "hips": "Pelvis", "spine": "L5 L3 T12 T8", "neck": "Neck", "head": "Head", "collar": "*Shoulder", "arm": "*UpperArm",
+    "elbow": "*ForeArm", "wrist": "*Hand", "thigh": "*UpperLeg", "knee": "*LowerLeg", "ankle": "*Foot", "toe": "*Toe",
+}  # fmt: skip
+STYLE = {
+    "hips": "Hips", "spine": "Chest Chest2 Chest3 Chest4 Chest5", "neck": "Neck", "head": "Head", "collar": "*Collar",
+    "arm": "*Shoulder", "elbow": "*Elbow", "wrist": "*Wrist", "thigh": "*Hip", "knee": "*Knee", "ankle": "*Ankle",
+    "toe": "*Toe",
+}  # fmt: skip
+UNREAL = {
+    "hips": "pelvis", "spine": "spine_01 spine_02", "neck": "neck_01", "head": "head", "collar": "clavicle_*",
+    "arm": "upperarm_*", "elbow": "lowerarm_*", "wrist": "hand_*", "thigh": "thigh_*", "knee": "calf_*",
+    "ankle": "foot_*", "toe": "ball_*", "finger1": "middle_01_*", "finger2": "middle_02_*",
+}  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def rig():
+    return load_canonical("mid")[1]
+
+
+def lafan_like():
+    return along_axes(moved(*biped(LAFAN, scale=1.05), seed=1))
+
+
+def mixamo_like():
+    return moved(*biped(MIXAMO), seed=2)
+
+
+def xsens_like():
+    """Rests with the arms hanging, a little bent."""
+    motion = moved(*biped(XSENS, spine=4, hands=False), seed=3)
+    turns = np.tile(np.eye(3), (len(motion.names), 1, 1))
+    for joint, name in enumerate(motion.names):
+        side = 1 if name.startswith("Left") else -1
+        if name.removeprefix("Left").removeprefix("Right") in ("UpperArm", "ForeArm", "Hand"):
+            bend = Rotation.from_rotvec([0, 0, -side * 1.45]) * Rotation.from_rotvec([0, -side * 0.2, 0])
+            turns[joint] = bend.as_matrix()
+    return in_another_pose(motion, turns)
+
+
+SOURCES = [lafan_like, mixamo_like, xsens_like,
+           lambda: moved(*biped(STYLE, spine=5, hands=False), seed=4), lambda: moved(*biped(UNREAL, spine=2), seed=5)]  # fmt: skip
+
+
+def bones_apart(source, found, rig):
+    """Largest angle [degrees] between each bone there and here, over the frames."""
+    report, here, there = found.report, soma_skeleton(found.motion, rig).positions(), source.positions()
+    joints = dict(report["joints"]) | {"Neck1": report["neck"][0]}
+    if len(report["spine"]) == 3:
+        joints |= dict(zip(("Spine1", "Spine2", "Chest"), report["spine"], strict=True))
+    apart = {}
+    for name in joints:
+        above = "Neck1" if name == "Head" else PARENT_NAMES[name]
+        # Several bones hang on these, whose angles to each other are those of the body.
+        if above in joints and above not in ("Hips", "Chest", "LeftHand", "RightHand"):
+            bone = here[:, USER_JOINTS.index(name)] - here[:, USER_JOINTS.index(above)]
+            index = [source.names.index(joints[each]) for each in (name, above)]
+            other = there[:, index[0]] - there[:, index[1]]
+            lengths = np.linalg.norm(bone, axis=-1) * np.linalg.norm(other, axis=-1)
+            sine = np.linalg.norm(np.cross(bone, other), axis=-1) / lengths
+            apart[name] = np.degrees(np.arctan2(sine, (bone * other).sum(-1) / lengths)).max()
+    return apart
+
+
+@pytest.mark.parametrize("make", SOURCES, ids=["lafan", "mixamo", "xsens", "100style", "unreal"])
+def test_bones_point_the_same_way(make, rig):
+    source = make()
+    apart = bones_apart(source, retarget(source), rig)
+    assert len(apart) >= 13
+    assert max(apart.values()) < SAME_DEGREES, apart
+
+
+def test_twist_comes_from_knees_and_elbows_where_bones_rest_along_axes(rig):
+    plain = moved(*biped(LAFAN), seed=6)
+    upright, aligned = (
+        soma_skeleton(retarget(each).motion, rig).turns() for each in (plain, along_axes(plain))
+    )
+    for name in ("LeftLeg", "RightShin", "LeftArm", "RightArm", "LeftForeArm"):
+        joint = USER_JOINTS.index(name)
+        cosine = (np.einsum("fab,fab->f", upright[:, joint], aligned[:, joint]) - 1) / 2
+        assert np.degrees(np.arccos(cosine.clip(-1, 1))).max() < 8, (
+            name
+        )  # a bent rest pose tells it otherwise
+    assert retarget(along_axes(plain)).report["rest_pose"] == "bones along axes"
+
+
+@pytest.mark.parametrize("spine", [2, 5])
+def test_a_spine_of_another_length_shares_out_its_turn(spine, rig):
+    names = STYLE if spine == 5 else UNREAL
+    bare = biped(names, spine=spine, hands=False)
+    motion = moved(*bare, seed=7)
+    bend = Rotation.from_rotvec([0.2, 0, 0]).as_matrix()
+    spines = [motion.names.index(name) for name in names["spine"].split()]
+    motion.rotations[:] = np.eye(3)
+    motion.rotations[:, spines] = bend
+    found = retarget(motion, match="limbs")
+    turns = soma_skeleton(found.motion, rig).turns()[0]
+    angles = [np.degrees(Rotation.from_matrix(turns[USER_JOINTS.index(name)]).magnitude())
+              for name in ("Spine1", "Spine2", "Chest", "Neck1")]  # fmt: skip
+    total = np.degrees(0.2 * spine)
+    assert angles[2:] == pytest.approx([total, total], abs=1e-3)
+    assert angles[1] - angles[0] == pytest.approx(angles[2] - angles[1], abs=1e-3)
+
+
+@pytest.mark.parametrize(("metres", "said"), [(1, 0), (0.01, 0), (0.001, 0), (0.0254, 1)])
+@pytest.mark.parametrize("up", ["+y", "+z", "-y"])
+def test_units_and_axes_are_told(metres, said, up, rig, caplog):
+    source = mixamo_like()
+    turn = {
+        "+y": np.eye(3),
+        "+z": np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]]),
+        "-y": np.diag([1.0, -1, -1]),
+    }[up]
+    with caplog.at_level(logging.WARNING):
+        found = retarget(source.placed(turn, 1 / metres))
+    meant = retarget(source)
+    assert len(caplog.records) == said
+    assert found.report["unit_metres"] == pytest.approx(metres)
+    assert found.report["up"] == up
+    assert np.abs(found.motion.rotations - meant.motion.rotations).max() < 1e-6
+    assert np.abs(found.motion.translation - meant.motion.translation).max() < 1e-5
+
+
+def test_feet_stand_where_they_stood(rig):
+    """The path of the middle between the legs, scaled by the legs, leaves the feet as far above the floor."""
+    source = mixamo_like()
+    source.rotations[:] = np.eye(3)
+    found = retarget(source)
+    scale = found.report["path_scale"]
+    here = soma_skeleton(found.motion, rig).positions()[:, USER_JOINTS.index("LeftFoot")]
+    there = source.positions()[:, source.names.index("mixamorig:LeftFoot")]
+    assert np.abs(here - scale * there)[:, 1].max() < 0.02  # [m]: legs that lean a little differ so much
+
+
+def test_names_that_are_not_known_give_the_template_of_a_mapping(tmp_path, rig):
+    strange = {part: " ".join(f"bone{index}*{word}" for word in range(len(names.split())))
+               for index, (part, names) in enumerate(LAFAN.items())}  # fmt: skip
+    source = moved(*biped(strange), seed=8)
+    write_bvh(source, tmp_path / "strange.bvh")
+    with pytest.raises(InputError, match="mapping=FILE") as caught:
+        convert_file(tmp_path / "strange.bvh", tmp_path / "out")
+    template = json.loads(re.search(r"\{.*\}", str(caught.value), re.DOTALL)[0])
+    parts = {"Shoulder": "collar", "Arm": "arm", "ForeArm": "elbow", "Hand": "wrist", "Leg": "thigh", "Shin": "knee",
+             "Foot": "ankle", "ToeBase": "toe"}  # fmt: skip
+    for target in template:
+        side = target[: len(target) - len(target.removeprefix("Left").removeprefix("Right"))]
+        part = (
+            parts[target.removeprefix(side)]
+            if side
+            else {"Hips": "hips", "Neck1": "neck", "Head": "head"}[target]
+        )
+        template[target] = strange[part].replace("*", side)
+    (tmp_path / "names.yaml").write_text("".join(f"{target}: {name}\n" for target, name in template.items()))
+    done = convert_file(
+        tmp_path / "strange.bvh",
+        tmp_path / "out",
+        options=ConvertOptions(mapping=str(tmp_path / "names.yaml")),
+    )
+    assert done.report["spine"] == strange["spine"].split()
+    assert bones_apart(source, retarget(source, mapping=template), rig)["LeftShin"] < SAME_DEGREES
+    (tmp_path / "names.json").write_text(json.dumps(template | {"LeftLeg": "nobody"}))
+    with pytest.raises(InputError, match="mapping: nobody"):
+        convert_file(
+            tmp_path / "strange.bvh",
+            tmp_path / "out",
+            options=ConvertOptions(mapping=str(tmp_path / "names.json")),
+        )
+
+
+def test_what_is_not_carried_over_is_listed(tmp_path):
+    names, parents, rest = biped(LAFAN)
+    source = moved((*names, "Tail"), np.append(parents, 0), np.vstack([rest, [0, 0.8, -0.2]]), seed=9)
+    write_bvh(source, tmp_path / "a.bvh")
+    report = convert_file(tmp_path / "a.bvh", tmp_path / "out").report
+    assert report["not_carried"] == ["Tail"]
+    assert "LeftHandIndex2" in report["at_rest"]
+    assert report["joints"]["LeftShin"] == "LeftLeg"
+
+
+@pytest.mark.parametrize("rest", ["t_pose", "bind"])
+def test_our_own_files_come_back_as_they_were(rest, rig, tmp_path):
+    source = retarget(mixamo_like()).motion
+    write_bvh(source, tmp_path / "a.bvh", rig=rig, rest=rest)
+    found = convert_file(tmp_path / "a.bvh", tmp_path / "out").motion()
+    assert np.abs(found.rotations - source.rotations).max() < 1e-5
+    assert np.abs(found.translation - source.translation).max() < 1e-6
+
+
+@pytest.mark.parametrize(("option", "value"), [("mapping", "x.json"), ("root", "Hips"), ("match", "limbs")])
+def test_settings_of_skeletons_are_refused_elsewhere(option, value, tmp_path):
+    turns = np.tile(np.eye(3), (2, 77, 1, 1))
+    np.savez(tmp_path / "a.npz", local_rot_mats=turns, root_positions=np.zeros((2, 3)))
+    with pytest.raises(InputError, match=f"{option}: got {value}"):
+        convert_file(tmp_path / "a.npz", tmp_path / "out", options=ConvertOptions(**{option: value}))
