@@ -1,35 +1,35 @@
-"""Read a pickle as plain data: no class is looked up, no function is called.
+"""The stack machine that a pickle is a program for, without the instructions that look up or call.
 
-A pickle is a program for a small stack machine. Of its instructions only those are known here that lay
-out data. Where the program names a class or a function, the name must be on a list, and all that is kept
-is a record of the name and what it would have been called with; :mod:`soma_core.io.pickled_arrays` makes
-arrays of the records it understands. Nothing is hashed or compared but texts and numbers, every length
-is checked against the file, and the number of instructions is bounded, so no program runs for long.
+Of the instructions only those are known here that lay out data. Where the program names a class or a
+function, the name must be on a list, and all that is kept is a record of the name and what it would have
+been called with. Nothing is hashed or compared but texts and small integers, every length is checked
+against the file, and the number of instructions is bounded, so no program runs for long.
 """
 
 from __future__ import annotations
 
 import codecs
 import mmap
+import re
 import struct
 import warnings
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any, NamedTuple
 
-from soma_core.errors import AssetError
-from soma_core.files import refuse_unreadable
-
-__all__ = ["ALLOWED_NAMES", "Global", "Record", "read_pickle"]
-
-MOST_BYTES = 600 * 2**20
-MOST_INSTRUCTIONS = 1_000_000
-"""The official files have some hundreds to some thousands."""
+__all__ = ["STORED", "Global", "PickleRules", "Record", "RefusedPickleError", "run_pickle"]
 
 _LONG_TEXT = 1024
 """Bytes from which on a string is left in the file until it is asked for."""
 
 _LONGEST_NUMBER = 64
+_LONGEST_NARROW = 2**20
+"""Bytes of text from which on it must be Latin-1: one wider character makes four bytes of each."""
+
+_WIDE = re.compile(rb"[\xc4-\xff]")
+"""First bytes, in UTF-8, of what lies beyond Latin-1."""
+
+_LARGEST_KEY, _MOST_KEYS = 2**31, 2**16
+"""Of integers as keys: Python hashes them to themselves, and thousands can be made to collide."""
 
 
 class Global(NamedTuple):
@@ -51,87 +51,82 @@ class Record:
         self.function, self.arguments, self.state = function, arguments, None
 
 
-_CORES = ("numpy.core", "numpy._core")
-_SPARSE = ("csc", "csr", "coo")
-ALLOWED_NAMES = frozenset(
-    {
-        Global("chumpy.ch", "Ch"),
-        Global("chumpy.reordering", "Select"),
-        Global("numpy", "ndarray"),
-        Global("numpy", "dtype"),
-        *(Global(f"{core}.multiarray", name) for core in _CORES for name in ("_reconstruct", "scalar")),
-        *(Global(f"{core}.numeric", "_frombuffer") for core in _CORES),
-        *(
-            Global(f"scipy.sparse.{module}", f"{kind}_matrix")
-            for kind in _SPARSE
-            for module in (kind, f"_{kind}")
-        ),
-        *(Global(module, name) for module in ("builtins", "__builtin__") for name in ("set", "object")),
-        Global("copyreg", "_reconstructor"),
-        Global("copy_reg", "_reconstructor"),
-        Global("_codecs", "encode"),
-    }
-)
-"""All that a body model's file may name; everything else ends the reading."""
+class RefusedPickleError(ValueError):
+    """Why this is nothing to read, said before it is known which file it is."""
 
 
-class _RefusedError(ValueError):
-    """Why this is no file to read, said before it is known which file it is."""
+class PickleRules(NamedTuple):
+    """What a pickle of one kind may hold.
+
+    `names` may be named; `purpose` says of what they are part; `stored` allows references to what lies
+    outside of the pickle, which come as records of :data:`STORED`.
+    """
+
+    names: frozenset[Global]
+    purpose: str
+    stored: bool = False
+    most_instructions: int = 1_000_000
 
 
-def read_pickle(path: Path | str) -> Any:
+STORED = Global("", "stored outside of the pickle")
+
+
+def run_pickle(data: mmap.mmap | bytes, rules: PickleRules) -> Any:
     """Contents of a pickle of protocols 0 to 5 as None, bool, int, float, text, bytes, tuple, list, dict.
 
     Strings of Python 2 are read as Latin-1; long ones come as a memoryview of the file. Sets come as
     lists; everything else as a :class:`Record`.
 
     Raises:
-        AssetError: missing, a git-LFS pointer, truncated, too large, or a pickle that names what is not in
-            `ALLOWED_NAMES` or has instructions that body models do not need.
+        RefusedPickleError: damaged, or with names, keys or instructions beyond the rules.
     """
-    refuse_unreadable(path, fix="Check the path.", most_bytes=MOST_BYTES)
-    with open(path, "rb") as stream:
-        data = mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ)
     try:
-        return _Machine(data).run()
-    except _RefusedError as error:
-        raise AssetError(
-            path,
-            cause=str(error),
-            fix="Nothing of it was run. Get the file from the model's official site.",
-        ) from error
+        return _Machine(data, rules).run()
+    except RefusedPickleError:
+        raise
     except (IndexError, KeyError, TypeError, ValueError, struct.error, OverflowError, MemoryError) as error:
-        cause = f"is no sound pickle ({type(error).__name__})"
-        raise AssetError(path, cause=cause, fix="Fetch the file again.") from error
+        raise RefusedPickleError(f"is no sound pickle ({type(error).__name__})") from error
+
+
+class _Ordered(dict[Any, Any]):
+    """A dictionary that the pickle makes by its class, and changes by what it calls its state."""
+
+
+_DICTIONARIES = (Global("collections", "OrderedDict"), Global("collections", "defaultdict"))
+_SETS = (Global("builtins", "set"), Global("__builtin__", "set"))
 
 
 class _Machine:
-    """The stack machine of a pickle, without the instructions that call."""
+    """A pickle under way."""
 
-    def __init__(self, file: mmap.mmap) -> None:
+    def __init__(self, file: mmap.mmap | bytes, rules: PickleRules) -> None:
         self._file, self._data, self._at = file, memoryview(file), 0
+        self._rules, self._integer_keys = rules, 0
         self._stack: list[Any] = []
         self._marks: list[int] = []
         self._memo: dict[int, Any] = {}
 
     def run(self) -> Any:
-        for _ in range(MOST_INSTRUCTIONS):
+        for _ in range(self._rules.most_instructions):
             code = self._take(1)[0]
             if code == ord("."):
                 return self._stack[-1]
             step = _STEPS.get(code)
             if step is None:
                 name = f"{chr(code)!r}" if 32 < code < 127 else f"{code:#04x}"
-                raise _RefusedError(f"is no pickle of plain data: instruction {name} at byte {self._at - 1}")
+                raise RefusedPickleError(
+                    f"is no pickle of plain data: instruction {name} at byte {self._at - 1}"
+                )
             step(self)
-        raise _RefusedError(f"is no body model: a pickle of more than {MOST_INSTRUCTIONS} instructions")
+        most = self._rules.most_instructions
+        raise RefusedPickleError(f"is not {self._rules.purpose}: a pickle of more than {most} instructions")
 
     # Reading
 
     def _take(self, count: int) -> memoryview:
         end = self._at + count
         if count < 0 or end > len(self._data):
-            raise _RefusedError(
+            raise RefusedPickleError(
                 f"is cut off: {count} bytes are wanted at byte {self._at} of {len(self._data)}"
             )
         taken = self._data[self._at : end]
@@ -141,7 +136,7 @@ class _Machine:
     def _line(self) -> bytes:
         end = self._file.find(b"\n", self._at)
         if end < 0:
-            raise _RefusedError(f"is cut off: a line has no end at byte {self._at}")
+            raise RefusedPickleError(f"is cut off: a line has no end at byte {self._at}")
         line = bytes(self._data[self._at : end])
         self._at = end + 1
         return line
@@ -161,7 +156,7 @@ class _Machine:
 
     def pop(self) -> Any:
         if self._marks and len(self._stack) <= self._marks[-1]:
-            raise _RefusedError("is no sound pickle: it takes a value that is not there")
+            raise RefusedPickleError("is no sound pickle: it takes a value that is not there")
         return self._stack.pop()
 
     def mark(self) -> None:
@@ -180,43 +175,65 @@ class _Machine:
     def append(self, items: list[Any]) -> None:
         target = self._stack[-1]
         if type(target) is not list:
-            raise _RefusedError(f"is no plain data: it appends to {_kind(target)}")
+            raise RefusedPickleError(f"is no plain data: it appends to {_kind(target)}")
         target.extend(items)
 
     def update(self, items: list[Any]) -> None:
         target = self._stack[-1]
-        if type(target) is not dict or len(items) % 2:
-            raise _RefusedError(f"is no plain data: it sets items of {_kind(target)}")
+        if type(target) not in (dict, _Ordered) or len(items) % 2:
+            raise RefusedPickleError(f"is no plain data: it sets items of {_kind(target)}")
         for key, value in zip(items[::2], items[1::2], strict=True):
             if type(key) not in (str, int):  # the hash of nested tuples can take for ever
-                raise _RefusedError(f"is no plain data: a key is {_kind(key)}")
+                raise RefusedPickleError(f"is no plain data: a key is {_kind(key)}")
+            if type(key) is int:
+                self._count_key(key)
             target[key] = value
+
+    def _count_key(self, key: int) -> None:
+        self._integer_keys += 1
+        if not -_LARGEST_KEY < key < _LARGEST_KEY or self._integer_keys > _MOST_KEYS:
+            raise RefusedPickleError(
+                f"is no plain data: more than {_MOST_KEYS} integers as keys, or one beyond {_LARGEST_KEY}"
+            )
 
     # What stands for classes and calls
 
     def name(self, module: Any, name: Any) -> None:
         if type(module) is not str or type(name) is not str:
-            raise _RefusedError(f"names a class by {_kind(module)} and {_kind(name)}")
-        if (module, name) not in ALLOWED_NAMES:
+            raise RefusedPickleError(f"names a class by {_kind(module)} and {_kind(name)}")
+        if (module, name) not in self._rules.names:
             shown = ascii(f"{module:.80}.{name:.80}")[1:-1]
-            raise _RefusedError(f"asks for {shown}, which is no part of a body model")
+            raise RefusedPickleError(f"asks for {shown}, which is no part of {self._rules.purpose}")
         self.push(Global(module, name))
 
     def call(self) -> None:
         arguments, function = self.pop(), self.pop()
         if type(function) is not Global or type(arguments) is not tuple:
-            raise _RefusedError(f"is no plain data: it calls {_kind(function)}")
-        self.push(Record(function, arguments))
+            raise RefusedPickleError(f"is no plain data: it calls {_kind(function)}")
+        if function in _SETS and all(type(values) is list for values in arguments):
+            self.push([value for values in arguments for value in values])
+            return
+        empty = function in _DICTIONARIES and not any(type(value) is not Global for value in arguments)
+        self.push(_Ordered() if empty else Record(function, arguments))
+
+    def stored(self) -> None:
+        if not self._rules.stored:
+            raise RefusedPickleError("is no pickle of plain data: it refers to something outside of it")
+        self.push(Record(STORED, (self.pop(),)))
 
     def build(self) -> None:
         state, target = self.pop(), self._stack[-1]
+        if type(target) is _Ordered:
+            return
         if type(target) is not Record:
-            raise _RefusedError(f"is no plain data: it changes {_kind(target)}")
+            raise RefusedPickleError(f"is no plain data: it changes {_kind(target)}")
         target.state = state
 
     # Memory of what was made before
 
     def put(self, index: int) -> None:
+        if not 0 <= index < self._rules.most_instructions:  # integers that collide would take for ever
+            raise RefusedPickleError(f"is no sound pickle: it remembers {index} values")
         self._memo[index] = self._stack[-1]
 
     def memoize(self) -> None:
@@ -240,7 +257,7 @@ class _Machine:
     def line_string(self) -> None:
         line = self._line().strip()
         if len(line) < 2 or line[:1] not in (b"'", b'"') or line[-1:] != line[:1]:
-            raise _RefusedError("is no sound pickle: a string is not in quotes")
+            raise RefusedPickleError("is no sound pickle: a string is not in quotes")
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # of escapes that newer versions of Python frown upon
             text = codecs.escape_decode(line[1:-1])[0]
@@ -260,7 +277,7 @@ class _Machine:
 
 def _parsed(line: bytes, kind: Callable[[bytes], Any]) -> Any:
     if len(line) > _LONGEST_NUMBER:
-        raise _RefusedError(f"holds a number of {len(line)} digits")
+        raise RefusedPickleError(f"holds a number of {len(line)} digits")
     return kind(line.strip().removesuffix(b"L"))
 
 
@@ -277,7 +294,13 @@ def _text(layout: str) -> Callable[[_Machine], None]:
 
 
 def _unicode(layout: str) -> Callable[[_Machine], None]:
-    return lambda machine: machine.push(str(machine._take(machine.number(layout)), "utf-8", "surrogatepass"))
+    return lambda machine: machine.push(_decoded(machine._take(machine.number(layout))))
+
+
+def _decoded(text: memoryview) -> str:
+    if len(text) >= _LONGEST_NARROW and _WIDE.search(text):
+        raise RefusedPickleError(f"holds a text of {len(text)} bytes, which are no array")
+    return str(text, "utf-8", "surrogatepass")
 
 
 def _number(layout: str) -> Callable[[_Machine], None]:
@@ -335,6 +358,6 @@ _STEPS: dict[int, Callable[[_Machine], object]] = {
         "g": lambda m: m.get(m.line_number()), "h": lambda m: m.get(m.number("<B")),
         "j": lambda m: m.get(m.number("<I")),
         "c": _Machine.line_name, "\x93": _Machine.stack_name,
-        "R": _Machine.call, "\x81": _Machine.call, "b": _Machine.build,
+        "R": _Machine.call, "\x81": _Machine.call, "b": _Machine.build, "Q": _Machine.stored,
     }.items()
 }  # fmt: skip
