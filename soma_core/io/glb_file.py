@@ -18,6 +18,9 @@ _MOST_NODES = 100_000
 _SMALL, _MOST_EXPANSION = 256 * 2**20, 64
 """Bytes that any file may unfold to, and times its size that a large one may."""
 
+_MOST_READ = 4
+"""The same for all accessors that are read, which may share their bytes."""
+
 _HARMLESS = ("KHR_materials_", "KHR_texture_")
 """Extensions that change how a body looks, not where it is."""
 
@@ -31,6 +34,7 @@ class GlbFile:
 
     def __init__(self, path: Path) -> None:
         self._data = np.memmap(path, np.uint8, mode="r")
+        self._left = max(_SMALL, _MOST_READ * len(self._data))
         magic, version, length = struct.unpack_from("<4sII", self._data.data)
         if magic != b"glTF" or version != 2:
             raise ValueError(f"it starts with {magic!r} and version {version}, not a GLB of version 2")
@@ -40,7 +44,9 @@ class GlbFile:
         if kind != b"JSON":
             raise ValueError(f"its first chunk is {kind!r}, not JSON")
         self.document: dict[str, Any] = parse_json(self._data[20 : 20 + size].tobytes())
-        self._begin = 28 + size
+        self._begin, self._length = 28 + size, max(len(self._data) - 28 - size, 0)
+        if type(self.document) is not dict:
+            raise ValueError("its JSON is no document")
         if len(self.document.get("nodes", ())) > _MOST_NODES:
             raise ValueError(f"it holds {len(self.document['nodes'])} nodes, more than {_MOST_NODES}")
         needed = [
@@ -61,15 +67,23 @@ class GlbFile:
         if "sparse" in accessor or "bufferView" not in accessor:
             raise ValueError(f"accessor {index} is sparse")
         dtype, shape = np.dtype(_COMPONENTS[accessor["componentType"]]), _SHAPES[accessor["type"]]
-        count = int(accessor["count"])
+        count = accessor["count"]
         view = self.document["bufferViews"][accessor["bufferView"]]
         if view["buffer"] != 0 or "uri" in self.document["buffers"][0]:
             raise ValueError("its arrays are in other files")
         size = dtype.itemsize * int(np.prod(shape, dtype=int))
-        offset = self._begin + view.get("byteOffset", 0) + accessor.get("byteOffset", 0)
-        stride = view.get("byteStride", size)
+        within, at = view.get("byteOffset", 0), accessor.get("byteOffset", 0)
+        stride, length = view.get("byteStride", size), view["byteLength"]
+        if not all(type(value) is int and value >= 0 for value in (count, within, at, stride, length)):
+            raise ValueError(f"accessor {index} has sizes that are none")
         if stride < size:
             raise ValueError(f"accessor {index} has overlapping values")
+        if (count and at + (count - 1) * stride + size > length) or within + length > self._length:
+            raise ValueError(f"accessor {index} leaves its part of the file")
+        offset = self._begin + within + at
+        self._left -= count * size
+        if self._left < 0:
+            raise ValueError("its accessors unfold to far more than the file holds")
         rows = np.ndarray((count, size), np.uint8, self._data, offset=offset, strides=(stride, 1))
         values = np.ascontiguousarray(rows).view(dtype).reshape(count, *shape)
         return np.swapaxes(values, -1, -2) if len(shape) == 2 else values

@@ -11,6 +11,7 @@ import numpy as np
 
 from soma_core.errors import AssetError, InputError
 from soma_core.io.vertex_sequence import VertexSequence, even_rate
+from soma_core.usd_stage import open_stage
 
 __all__ = ["UsdSequence"]
 
@@ -20,17 +21,18 @@ class UsdSequence(VertexSequence):
 
     Args:
         path: ``.usd``, ``.usda``, ``.usdc`` or ``.usdz``.
+        allow_references: follow references that lead out of the folder of the file.
 
     Raises:
-        AssetError: not a USD file.
+        AssetError: not a USD file, or one that refers to what may not be opened.
         InputError: no mesh or several that move, blend shapes, or samples at uneven times.
     """
 
-    def __init__(self, path: Path) -> None:
-        from pxr import Usd, UsdGeom
+    def __init__(self, path: Path, *, allow_references: bool = False) -> None:
+        from pxr import UsdGeom
 
+        self._stage: Any = open_stage(path, fix="Export it again.", allow_references=allow_references)
         with _usd_errors(path):
-            self._stage = Usd.Stage.Open(str(path))
             self._points, self._skin, times = _moving_mesh(path, self._stage)
         self._times = times or [self._stage.GetStartTimeCode()]
         rate = self._stage.GetTimeCodesPerSecond()

@@ -72,10 +72,12 @@ class InvertOptions(FitOptions):
 
     Attributes:
         topology: which mesh they are vertices of; ``auto`` tells it by their number.
+        allow_references: let a USD file refer to what lies outside of its folder.
     """
 
     backend: BackendChoice = field(default_factory=lambda: BackendChoice(name="soma"))
     topology: Topology = Topology.auto
+    allow_references: bool = False
 
 
 @dataclass(kw_only=True)
