@@ -35,7 +35,7 @@ def read_json(path: Path | str, *, fix: str) -> Any:
     Raises:
         AssetError: missing, no regular file, a git-LFS pointer, too long, or no JSON.
     """
-    refuse_unreadable(path, fix=fix, most_bytes=_MOST_BYTES)
+    refuse_unreadable(path, fix=fix, most_bytes=_MOST_BYTES // 2)
     try:
         return parse_json(Path(path).read_text(encoding="utf-8"))
     except ValueError as error:

@@ -66,7 +66,7 @@ def _checked(layer: Any, written: str, folder: str, *, anywhere: bool) -> str | 
     while Ar.IsPackageRelativePath(outer):
         outer = Ar.SplitPackageRelativePathOuter(outer)[0]
     real = os.path.realpath(str(Ar.GetResolver().Resolve(outer)) or outer)
-    if not anywhere and not Path(real).is_relative_to(folder):
+    if not anywhere and ("://" in written or not Path(real).is_relative_to(folder)):
         raise _RefusedError(f"refers to {written[:200]}, which is outside of its folder")
     if os.path.exists(real) and not os.path.isfile(real):
         raise _RefusedError(f"refers to {written[:200]}, which is no file")

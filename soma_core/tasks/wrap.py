@@ -97,18 +97,28 @@ def _options(config: DictConfig, native: NativeMesh) -> WrapOptions:
             )
         known[key] = value or known.get(key)
     known["unit"] = str(config.unit) if config.unit else known.get("unit")
-    landmarks = _json(config.landmarks, dict, '{"canonical vertex id": native vertex id}')
+    landmarks = {} if config.landmarks is None else read_landmarks(config.landmarks)
     masked = _json(config.mask, list, "a list of native vertex ids")
     return WrapOptions(
         **known,
         fill=tuple(config.fill),
         symmetric=config.symmetric,
-        landmarks={int(key): int(value) for key, value in landmarks.items()},
+        landmarks=landmarks,
         masked=[int(value) for value in masked],
     )
 
 
-def _json(name: str | None, kind: type, expected: str) -> Any:
+def read_landmarks(name: str | Path) -> dict[int, int]:
+    """Canonical vertex id -> native vertex id, of a JSON file.
+
+    Raises:
+        AssetError: missing, or something else.
+    """
+    found = _json(name, dict, '{"canonical vertex id": native vertex id}')
+    return {int(key): int(value) for key, value in found.items()}
+
+
+def _json(name: str | Path | None, kind: type, expected: str) -> Any:
     """Content of a JSON file of integers, empty where none is named."""
     if name is None:
         return kind()

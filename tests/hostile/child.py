@@ -1,11 +1,12 @@
 """Read hostile files in this process, which has limits and may die; say what became of each.
 
-Run as ``python -m tests.hostile.child READER FOLDER``, with a request a line on stdin and an answer a line on
-stdout: a name of the corpus, or ``mutation SEED``.
+Run as ``python -m tests.hostile.child FOLDER``, with a request a line on stdin and an answer each on stdout: the
+reader, a tab, and a name of the corpus or ``mutation SEED``.
 """
 
 from __future__ import annotations
 
+import functools
 import json
 import os
 import random
@@ -20,6 +21,7 @@ from tests.hostile.corpus import FILES, LINKS, SENTINEL
 from tests.hostile.readers import READERS
 
 _EVENTS = ("os.system", "os.exec", "pickle.find_class")
+BY_NAME = {reader.name: reader for reader in READERS}
 _watched: list[str] = []
 
 
@@ -90,26 +92,34 @@ def _make(name: str, path: Path, good: bytes) -> None:
         path.write_bytes(content if isinstance(content, bytes) else content())
 
 
-def _main(name: str, folder: Path) -> None:
-    reader = next(reader for reader in READERS if reader.name == name)
+@functools.cache
+def _good(name: str, folder: Path) -> bytes:
+    """A sound file of a reader, which it reads; nothing where there is none that is small."""
+    reader, path = BY_NAME[name], folder / f"good{BY_NAME[name].suffix}"
+    if reader.good is None:
+        return b""
+    reader.good(path)
+    reader.read(path)
+    return path.read_bytes()
+
+
+def _main(folder: Path) -> None:
     os.chdir(folder)
     warnings.simplefilter("ignore")  # numpy and scipy warn of damaged numbers, which is no refusal
-    good = b""
-    if reader.good is not None:
-        reader.good(folder / f"good{reader.suffix}")
-        good = (folder / f"good{reader.suffix}").read_bytes()
-        reader.read(folder / f"good{reader.suffix}")
+    for name in BY_NAME:  # what is imported and compiled at first is no harm of a file
+        _good(name, folder)
     sys.addaudithook(_audit)
     most = resource.getrlimit(resource.RLIMIT_DATA)[1]
     resource.setrlimit(resource.RLIMIT_DATA, (4 * 2**30, most))
     for count, line in enumerate(sys.stdin):
-        path = folder / f"hostile{count}{reader.suffix}"
-        _make(line.rstrip("\n"), path, good)
-        sys.stdout.write(json.dumps(_outcome(reader, path)) + "\n")
+        reader, _, name = line.rstrip("\n").partition("\t")
+        path = folder / f"hostile{count}{BY_NAME[reader].suffix}"
+        _make(name, path, _good(reader, folder))
+        sys.stdout.write(json.dumps(_outcome(BY_NAME[reader], path)) + "\n")
         sys.stdout.flush()
         if not path.is_dir():
             path.unlink(missing_ok=True)
 
 
 if __name__ == "__main__":
-    _main(sys.argv[1], Path(sys.argv[2]))
+    _main(Path(sys.argv[1]))

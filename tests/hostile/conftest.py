@@ -1,4 +1,4 @@
-"""A process for each reader, which answers for one file after the other: a crash is a finding, no end."""
+"""One process, which answers for one file after the other: a crash is a finding, no end."""
 
 from __future__ import annotations
 
@@ -24,18 +24,17 @@ MOST_MEMORY = 2**30
 class _Child:
     """One process; it is started again after it died."""
 
-    def __init__(self, reader: str, folder: Path) -> None:
-        self._reader, self._folder, self._process = reader, folder, None
+    def __init__(self, folder: Path) -> None:
+        self._folder, self._process = folder, None
 
-    def ask(self, name: str) -> dict:
+    def ask(self, reader: str, name: str) -> dict:
         """What became of a file, by its name in the corpus or as a mutation."""
         if self._process is None:
-            self._folder.mkdir(exist_ok=True)
             self._process = subprocess.Popen(
-                [sys.executable, "-m", "tests.hostile.child", self._reader, str(self._folder)],
-                stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True, bufsize=1,
+                [sys.executable, "-m", "tests.hostile.child", str(self._folder)], stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True, bufsize=1,
             )  # fmt: skip
-        self._process.stdin.write(f"{name}\n")
+        self._process.stdin.write(f"{reader}\t{name}\n")
         self._process.stdin.flush()
         if not select.select([self._process.stdout], [], [], PATIENCE)[0]:
             self.stop()
@@ -60,15 +59,10 @@ class _Child:
 @pytest.fixture(scope="package")
 def ask(tmp_path_factory) -> Iterator[Callable[[str, str], str | None]]:
     """Let a reader read a file: what it said, None for a value; anything else fails the test."""
-    children: dict[str, _Child] = {}
+    child = _Child(tmp_path_factory.mktemp("hostile"))
 
     def asked(reader: str, name: str) -> str | None:
-        if reader not in children:
-            for other in children.values():  # one at a time: torch alone takes 300 MB
-                other.stop()
-            folder = tmp_path_factory.mktemp("hostile") / "files"
-            children[reader] = _Child(reader, folder)
-        found = children[reader].ask(name)
+        found = child.ask(reader, name)
         assert not found["executed"], f"{name} ran code"
         assert not found["events"], f"{name} led to {found['events']}"
         told = found["told"]
@@ -78,5 +72,4 @@ def ask(tmp_path_factory) -> Iterator[Callable[[str, str], str | None]]:
         return told
 
     yield asked
-    for child in children.values():
-        child.stop()
+    child.stop()

@@ -10,7 +10,7 @@ from tests.hostile.corpus import FILES, LINKS
 from tests.hostile.readers import READERS
 
 each_reader = pytest.mark.parametrize("reader", READERS, ids=lambda reader: reader.name)
-KINDS = {".npy": "array", ".usdz": "npz", ".pkl": "pickle", ".pca": "point.pca", ".json": "JSON"}
+KINDS = {".npy": "array", ".usdz": "npz", ".pkl": "pickle", ".pca": "point.pca", ".json": "JSON", ".pt": "pt"}
 """Suffix -> first word of the names of hostile files of that format, where it is not the suffix."""
 
 FOR_ALL = (
