@@ -1,7 +1,7 @@
 """Read hostile files in this process, which has limits and may die; say what became of each.
 
-Run as ``python -m tests.hostile.child FOLDER``, with a request a line on stdin and an answer each on stdout: the
-reader, a tab, and a name of the corpus or ``mutation SEED``.
+Run as ``python -m tests.hostile.child FOLDER``, with a request a line on stdin and an answer each on stdout:
+the reader, a tab, and a name of the corpus or ``mutation SEED``.
 """
 
 from __future__ import annotations
