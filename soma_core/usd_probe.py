@@ -95,14 +95,16 @@ def _touch(stage: Any) -> None:
     """Read values, so that damage is met here: as many as a second allows."""
     end = time.monotonic() + _TOUCHING_S
     for prim in _prims(stage):
+        for attribute in prim.GetAuthoredAttributes() if time.monotonic() < end else ():
+            _touch_samples(attribute, end)
+
+
+def _touch_samples(attribute: Any, end: float) -> None:
+    attribute.Get()
+    for sample in attribute.GetTimeSamples():
         if time.monotonic() > end:
-            continue
-        for attribute in prim.GetAuthoredAttributes():
-            attribute.Get()
-            for sample in attribute.GetTimeSamples():
-                if time.monotonic() > end:
-                    break
-                attribute.Get(sample)
+            return
+        attribute.Get(sample)
 
 
 def _probe(path: Path, *, anywhere: bool) -> str | None:

@@ -37,9 +37,9 @@ def open_archive(
         AssetError: missing, a git-LFS pointer, too large, no archive, or a damaged or endless directory.
     """
     head = refuse_unreadable(path, fix=fix, most_bytes=most_bytes)
-    if not zipfile.is_zipfile(path):
-        raise AssetError(path, cause=f"not {kind} (it starts with {head[:8]!r})", fix=fix)
     try:
+        if not zipfile.is_zipfile(path):
+            raise AssetError(path, cause=f"not {kind} (it starts with {head[:8]!r})", fix=fix)
         _refuse_long_directory(Path(path))
         archive = zipfile.ZipFile(path)
     except ARCHIVE_DAMAGE as error:
