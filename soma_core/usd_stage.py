@@ -6,19 +6,21 @@ import os
 import re
 import subprocess
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from soma_core.errors import AssetError
+from soma_core.errors import AssetError, SomaError
 from soma_core.files import refuse_unreadable
 from soma_core.json_file import parse_json
 
 if TYPE_CHECKING:
     from pxr import Usd
 
-__all__ = ["open_stage"]
+__all__ = ["open_stage", "usd_errors"]
 
 _MOST_PLAIN = 32 * 2**20
 """Bytes of text that are looked through here; longer ones are opened in a process of their own first."""
@@ -54,9 +56,23 @@ def open_stage(path: Path | str, *, fix: str, allow_references: bool = False) ->
         _try_apart(path, fix, allow_references=allow_references)
     from pxr import Usd
 
-    try:
+    with usd_errors(path, fix=fix):
         return Usd.Stage.Open(str(path))
-    except RuntimeError as error:  # Tf.ErrorException
+
+
+@contextmanager
+def usd_errors(path: Path, *, fix: str) -> Iterator[None]:
+    """Name the file where USD fails, or gives values of other types than its schema says.
+
+    Raises:
+        AssetError: in place of what USD and its values raise; errors of this project pass.
+    """
+    try:
+        yield
+    except SomaError:
+        raise
+    except (RuntimeError, TypeError, ValueError, IndexError, AttributeError, OverflowError) as error:
+        # Tf.ErrorException is a RuntimeError with lines of C++.
         raise AssetError(path, cause=f"USD cannot read it ({_last_line(error)})", fix=fix) from error
 
 

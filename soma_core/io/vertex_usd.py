@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -11,9 +9,11 @@ import numpy as np
 
 from soma_core.errors import AssetError, InputError
 from soma_core.io.vertex_sequence import VertexSequence, even_rate
-from soma_core.usd_stage import open_stage
+from soma_core.usd_stage import open_stage, usd_errors
 
 __all__ = ["UsdSequence"]
+
+_FIX = "Export it again."
 
 
 class UsdSequence(VertexSequence):
@@ -31,8 +31,8 @@ class UsdSequence(VertexSequence):
     def __init__(self, path: Path, *, allow_references: bool = False) -> None:
         from pxr import UsdGeom
 
-        self._stage: Any = open_stage(path, fix="Export it again.", allow_references=allow_references)
-        with _usd_errors(path):
+        self._stage: Any = open_stage(path, fix=_FIX, allow_references=allow_references)
+        with usd_errors(path, fix=_FIX):
             self._points, self._skin, times = _moving_mesh(path, self._stage)
         self._times = times or [self._stage.GetStartTimeCode()]
         rate = self._stage.GetTimeCodesPerSecond()
@@ -46,7 +46,7 @@ class UsdSequence(VertexSequence):
         )
 
     def _read(self, start: int, stop: int) -> np.ndarray:
-        with _usd_errors(self.path):
+        with usd_errors(self.path, fix=_FIX):
             return np.stack([self._frame(time) for time in self._times[start:stop]])
 
     def _frame(self, time: float) -> np.ndarray:
@@ -74,15 +74,6 @@ class UsdSequence(VertexSequence):
     def close(self) -> None:
         """Let go of the stage."""
         self._skin = self._points = self._stage = None
-
-
-@contextmanager
-def _usd_errors(path: Path) -> Iterator[None]:
-    """Name the file where USD fails: pxr raises Tf.ErrorException, a RuntimeError with C++ source lines."""
-    try:
-        yield
-    except RuntimeError as error:
-        raise AssetError(path, cause="not a readable USD file", fix="Export it again.") from error
 
 
 def _moving_mesh(path: Path, stage: Any) -> tuple[Any, Any, list[float]]:

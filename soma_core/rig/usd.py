@@ -18,7 +18,7 @@ from soma_core.rig.procedural import ProceduralDefinition
 from soma_core.rig.skeleton import Rig
 from soma_core.rig.stored import StoredRig
 from soma_core.rig.transforms import world_transforms
-from soma_core.usd_stage import open_stage
+from soma_core.usd_stage import open_stage, usd_errors
 
 if TYPE_CHECKING:
     from pxr import Usd, UsdSkel
@@ -274,11 +274,13 @@ def read_usd_rig(
             weights that are negative, not finite, do not sum to 1 or name unknown joints, or a skeleton
             without a joint of the definition.
     """
-    stage = open_stage(path, fix=f"{RESTORE}; a text layer that ends early was truncated")
-    skin = _choose_mesh(path, stage, mesh, lod)
-    stored = _read_stored(path, stage, skin)
-    indices, counts = _polygons(path, skin, len(stored.bind_shape))
-    uv, uv_indices = _texture(skin, len(indices))
+    fix = f"{RESTORE}; a text layer that ends early was truncated"
+    stage = open_stage(path, fix=fix)
+    with usd_errors(path, fix=fix):
+        skin = _choose_mesh(path, stage, mesh, lod)
+        stored = _read_stored(path, stage, skin)
+        indices, counts = _polygons(path, skin, len(stored.bind_shape))
+        uv, uv_indices = _texture(skin, len(indices))
     public = stored if definition is None else public_rig(path, stored, definition)
     digest = public.digest(_fan_triangles(indices, counts) if triangles is None else triangles)
     rig = public.metric(digest)

@@ -12,6 +12,7 @@ from soma_core.errors import AssetError, InputError
 from soma_core.io import open_vertex_sequence
 from soma_core.io.gltf import write_gltf
 from soma_core.io.mesh_vertices import read_mesh_vertices, read_ply_triangles
+from soma_core.obj import read_obj
 
 FILE_TOLERANCE_MM = 0.01
 """Float32 positions within four metres of the origin, skinned in float32."""
@@ -491,3 +492,21 @@ def test_faces_of_a_ply_are_fans_in_order(tmp_path, order):
     path.write_bytes((head.encode() + body)[:-12])
     with pytest.raises(AssetError, match=r"a\.ply: no readable faces"):
         read_ply_triangles(path, 5)
+
+
+def test_numbers_of_other_scripts_in_names_are_no_numbers(tmp_path):
+    for name in ("²1.obj", "f10.obj", "f2.obj", "٣.obj", "f" + "9" * 200 + ".obj"):
+        (tmp_path / name).write_text("v 0 0 0\nv 1 0 0\n")
+    with open_vertex_sequence(tmp_path) as sequence:
+        names = [file.name for file in sequence._files]
+    assert names.index("f2.obj") < names.index("f10.obj")
+
+
+def test_an_obj_takes_little_more_than_its_numbers(tmp_path):
+    path, count = tmp_path / "a.obj", 20_000
+    path.write_text("v 0.25 0.5 0.75\n" * count + "f 1 2 3\n" * count)
+    tracemalloc.start()
+    read_obj(path)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 4 * 48 * count  # 48 bytes of result a pair of lines, twice while it is copied
