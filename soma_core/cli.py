@@ -32,6 +32,7 @@ __all__ = [
 ]
 
 EXIT_INTERRUPTED = 130
+_PLACE = "Make room, give the right to it, or choose another folder: hydra.run.dir=FOLDER."
 EXIT_PIPE = 141
 """What a shell reports for a program whose reader went away, as in ``soma --help | head -1``."""
 
@@ -194,6 +195,13 @@ def main(arguments: Sequence[str]) -> int:
             raise
         _complain(str(error))
         return _exit_code(error)
+    except BrokenPipeError:
+        raise
+    except OSError as error:  # a full disk, a folder that may not be written: no defect
+        if os.environ.get("SOMA_STRICT") == "1" or error.errno is None:
+            raise
+        _complain(f"{error.filename or 'a file'}: {error.strerror}. {_PLACE}")
+        return EXIT_FAILED
     except KeyboardInterrupt:
         _complain("interrupted")
         return EXIT_INTERRUPTED

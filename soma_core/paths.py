@@ -5,6 +5,8 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
+from soma_core.errors import InputError
+
 __all__ = ["assets_dir", "cache_dir", "configs_dir", "data_dir"]
 
 _PACKAGE = Path(__file__).resolve().parent
@@ -33,7 +35,7 @@ def cache_dir() -> Path:
     if override:
         return Path(override).expanduser()
     base = os.environ.get("XDG_CACHE_HOME")
-    return (Path(base) if base else Path.home() / ".cache") / "soma_core"
+    return (Path(base) if base else _home("SOMA_CACHE_DIR") / ".cache") / "soma_core"
 
 
 def data_dir() -> Path:
@@ -45,4 +47,13 @@ def data_dir() -> Path:
     if override:
         return Path(override).expanduser()
     base = os.environ.get("XDG_DATA_HOME")
-    return (Path(base) if base else Path.home() / ".local" / "share") / "soma_core"
+    return (Path(base) if base else _home("SOMA_DATA_DIR") / ".local" / "share") / "soma_core"
+
+
+def _home(instead: str) -> Path:
+    try:
+        return Path.home()
+    except RuntimeError as error:
+        raise InputError(
+            "HOME", got="no home folder", expected="one, for this user", fix=f"Set {instead}=FOLDER."
+        ) from error

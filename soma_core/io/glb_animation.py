@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -11,6 +12,9 @@ from scipy.spatial.transform import Rotation
 from soma_core.io.glb_file import GlbFile
 
 __all__ = ["NodeTracks"]
+
+_MOST_MOVED = 10_000
+"""Nodes that a body may hang on."""
 
 _REST = {"translation": (0.0, 0.0, 0.0), "rotation": (0.0, 0.0, 0.0, 1.0), "scale": (1.0, 1.0, 1.0)}
 
@@ -48,6 +52,7 @@ class NodeTracks:
     def __init__(self, file: GlbFile) -> None:
         document = file.document
         self._nodes: list[dict[str, Any]] = document.get("nodes", [])
+        self._read: dict[int, np.ndarray] = {}
         self._tracks: dict[tuple[int, str], _Track] = {}
         animations = document.get("animations", [])
         if len(animations) > 1:
@@ -63,14 +68,20 @@ class NodeTracks:
             raise ValueError(f"it interpolates by {kind}, expected LINEAR or STEP")
         if "node" not in target:
             return
-        times = file.accessor(sampler["input"]).astype(np.float64)
-        values = file.fractions(sampler["output"]).astype(np.float64)
+        times = self._numbers(file, sampler["input"])
+        values = self._numbers(file, sampler["output"])
         if target["path"] == "weights":
             values = values.reshape(len(times), -1)
         if len(values) != len(times) or np.any(np.diff(times) <= 0):
             raise ValueError(f"the keys of node {target['node']} are out of order or incomplete")
         track = _Track(times=times, values=values, step=kind == "STEP")
         self._tracks[target["node"], target["path"]] = track
+
+    def _numbers(self, file: GlbFile, index: int) -> np.ndarray:
+        """Values of an accessor, which many tracks may share."""
+        if index not in self._read:
+            self._read[index] = file.fractions(index).astype(np.float64)
+        return self._read[index]
 
     @property
     def times(self) -> np.ndarray:
@@ -93,13 +104,26 @@ class NodeTracks:
         rest = np.asarray(self._nodes[node].get("weights", np.zeros(count)), np.float64)
         return np.tile(rest, (len(times), 1))
 
-    def worlds(self, times: np.ndarray) -> np.ndarray:
-        """World transforms (times, nodes, 4, 4) float64."""
-        worlds = np.empty((len(times), len(self._nodes), 4, 4))
-        for node in self._order:
+    def worlds(self, times: np.ndarray, nodes: Sequence[int] | None = None) -> np.ndarray:
+        """World transforms (times, nodes, 4, 4) float64 of some nodes, in their order; None: of all."""
+        wanted = range(len(self._nodes)) if nodes is None else nodes
+        place = {node: row for row, node in enumerate(self._with_ancestors(wanted))}
+        worlds = np.empty((len(times), len(place), 4, 4))
+        for node, row in place.items():
             local, parent = self._local(node, times), self._parents[node]
-            worlds[:, node] = local if parent < 0 else worlds[:, parent] @ local
-        return worlds
+            worlds[:, row] = local if parent < 0 else worlds[:, place[parent]] @ local
+        return worlds[:, [place[node] for node in wanted]]
+
+    def _with_ancestors(self, nodes: Sequence[int]) -> list[int]:
+        """The nodes and all above them, parents before children."""
+        needed: set[int] = set()
+        for node in nodes:
+            while node >= 0 and node not in needed:
+                needed.add(node)
+                node = self._parents[node]
+        if len(needed) > _MOST_MOVED:
+            raise ValueError(f"its body hangs on {len(needed)} nodes, more than {_MOST_MOVED}")
+        return [node for node in self._order if node in needed]
 
     def _local(self, node: int, times: np.ndarray) -> np.ndarray:
         if "matrix" in self._nodes[node]:
@@ -120,6 +144,8 @@ def _top_down(nodes: list[dict[str, Any]]) -> tuple[list[int], list[int]]:
     parents = [-1] * len(nodes)
     for index, node in enumerate(nodes):
         for child in node.get("children", ()):
+            if child < 0:
+                raise ValueError(f"node {index} has the child {child}")
             parents[child] = index
     order = [node for node, parent in enumerate(parents) if parent < 0]
     for parent in order:  # grows while it is walked

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-import json
 import struct
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+
+from soma_core.json_file import parse_json
 
 __all__ = ["GlbFile"]
 
@@ -16,6 +17,9 @@ _SHAPES: dict[str, tuple[int, ...]] = {"SCALAR": (), "VEC2": (2,), "VEC3": (3,),
 _MOST_NODES = 100_000
 _SMALL, _MOST_EXPANSION = 256 * 2**20, 64
 """Bytes that any file may unfold to, and times its size that a large one may."""
+
+_MOST_READ = 4
+"""The same for all accessors that are read, which may share their bytes."""
 
 _HARMLESS = ("KHR_materials_", "KHR_texture_")
 """Extensions that change how a body looks, not where it is."""
@@ -30,6 +34,7 @@ class GlbFile:
 
     def __init__(self, path: Path) -> None:
         self._data = np.memmap(path, np.uint8, mode="r")
+        self._left = max(_SMALL, _MOST_READ * len(self._data))
         magic, version, length = struct.unpack_from("<4sII", self._data.data)
         if magic != b"glTF" or version != 2:
             raise ValueError(f"it starts with {magic!r} and version {version}, not a GLB of version 2")
@@ -38,8 +43,10 @@ class GlbFile:
         size, kind = struct.unpack_from("<I4s", self._data.data, 12)
         if kind != b"JSON":
             raise ValueError(f"its first chunk is {kind!r}, not JSON")
-        self.document: dict[str, Any] = json.loads(self._data[20 : 20 + size].tobytes())
-        self._begin = 28 + size
+        self.document: dict[str, Any] = parse_json(self._data[20 : 20 + size].tobytes())
+        self._begin, self._length = 28 + size, max(len(self._data) - 28 - size, 0)
+        if type(self.document) is not dict:
+            raise ValueError("its JSON is no document")
         if len(self.document.get("nodes", ())) > _MOST_NODES:
             raise ValueError(f"it holds {len(self.document['nodes'])} nodes, more than {_MOST_NODES}")
         needed = [
@@ -57,34 +64,48 @@ class GlbFile:
     def accessor(self, index: int) -> np.ndarray:
         """Values of an accessor, (count, ...); matrices as column-vector transforms (count, 4, 4)."""
         accessor = self.document["accessors"][index]
-        shape, count = _SHAPES[accessor["type"]], int(accessor["count"])
+        shape, count = _SHAPES[accessor["type"]], accessor["count"]
         if "bufferView" in accessor:
             values = self._stored(accessor, accessor["componentType"], shape, count, f"accessor {index}")
         else:  # zeros, but for sparse ones
             dtype = np.dtype(_COMPONENTS[accessor["componentType"]])
-            self.check_expansion(count * dtype.itemsize * int(np.prod(shape, dtype=int)), "its arrays")
+            self._unfold(count, dtype.itemsize * int(np.prod(shape, dtype=int)))
             values = np.zeros((count, *shape), dtype)
         if "sparse" in accessor:
             sparse, what = accessor["sparse"], f"sparse accessor {index}"
-            ids, some = sparse["indices"], int(sparse["count"])
+            ids, some = sparse["indices"], sparse["count"]
             places = self._stored(ids, ids["componentType"], (), some, what)
             if some and not (places.dtype.kind == "u" and places.max() < count):
                 raise ValueError(f"{what} has places outside it")
             values[places] = self._stored(sparse["values"], accessor["componentType"], shape, some, what)
         return np.swapaxes(values, -1, -2) if len(shape) == 2 else values
 
+    def _unfold(self, count: Any, size: int) -> None:
+        """Count what an array of `count` values takes against what a file of this size may unfold to."""
+        if type(count) is not int or count < 0:
+            raise ValueError(f"an accessor has {count!r} values")
+        self._left -= count * size
+        if self._left < 0:
+            raise ValueError("its accessors unfold to far more than the file holds")
+
     def _stored(
-        self, place: dict[str, Any], component: int, shape: tuple[int, ...], count: int, what: str
+        self, place: dict[str, Any], component: int, shape: tuple[int, ...], count: Any, what: str
     ) -> np.ndarray:
         """A copy of `count` values at a place in a buffer view."""
         dtype, view = np.dtype(_COMPONENTS[component]), self.document["bufferViews"][place["bufferView"]]
         if view["buffer"] != 0 or "uri" in self.document["buffers"][0]:
             raise ValueError("its arrays are in other files")
         size = dtype.itemsize * int(np.prod(shape, dtype=int))
-        offset = self._begin + view.get("byteOffset", 0) + place.get("byteOffset", 0)
-        stride = view.get("byteStride", size)
+        within, at = view.get("byteOffset", 0), place.get("byteOffset", 0)
+        stride, length = view.get("byteStride", size), view["byteLength"]
+        if not all(type(value) is int and value >= 0 for value in (count, within, at, stride, length)):
+            raise ValueError(f"{what} has sizes that are none")
         if stride < size:
             raise ValueError(f"{what} has overlapping values")
+        if (count and at + (count - 1) * stride + size > length) or within + length > self._length:
+            raise ValueError(f"{what} leaves its part of the file")
+        offset = self._begin + within + at
+        self._unfold(count, size)
         rows = np.ndarray((count, size), np.uint8, self._data, offset=offset, strides=(stride, 1))
         return np.array(rows).view(dtype).reshape(count, *shape)
 

@@ -17,10 +17,8 @@ from soma_core.topology.frames import METRES
 
 __all__ = ["open_vertex_sequence"]
 
-_READERS = {
-    ".npz": open_npz_vertices, ".npy": open_npy, ".glb": GlbSequence,
-    ".usd": UsdSequence, ".usda": UsdSequence, ".usdc": UsdSequence, ".usdz": UsdSequence,
-}  # fmt: skip
+_READERS = {".npz": open_npz_vertices, ".npy": open_npy, ".glb": GlbSequence}
+_USD = (".usd", ".usda", ".usdc", ".usdz")
 
 
 def open_vertex_sequence(
@@ -29,6 +27,7 @@ def open_vertex_sequence(
     fps: float | None = None,
     unit: Literal["m", "cm", "mm"] | None = None,
     up: UpAxis | None = None,
+    allow_references: bool = False,
 ) -> VertexSequence:
     """Open the vertices of a mesh over time; frames are read when they are asked for.
 
@@ -38,13 +37,14 @@ def open_vertex_sequence(
         fps: frame rate; overrides the file's own.
         unit: length unit; overrides the file's own.
         up: upward axis; overrides the file's own.
+        allow_references: let a USD file refer to what lies outside of its folder.
 
     Raises:
         AssetError: the file is missing, damaged or a git-LFS pointer.
         InputError: a format or a layout that is not read, or a frame rate that is not positive.
     """
     path = Path(path).expanduser()
-    sequence = _open(path)
+    sequence = _open(path, allow_references=allow_references)
     if fps is not None:
         sequence.fps = float(fps)
     if sequence.fps is not None and not (math.isfinite(sequence.fps) and sequence.fps > 0):
@@ -60,16 +60,18 @@ def open_vertex_sequence(
     return sequence
 
 
-def _open(path: Path) -> VertexSequence:
+def _open(path: Path, *, allow_references: bool) -> VertexSequence:
     if path.is_dir():
         return FolderSequence(path)
     refuse_unreadable(path)
+    if path.suffix.lower() in _USD:
+        return UsdSequence(path, allow_references=allow_references)
     reader = _READERS.get(path.suffix.lower())
     if reader is None:
         raise InputError(
             str(path),
             got=f"the suffix {path.suffix!r}",
-            expected=f"{', '.join(_READERS)} or a folder of .obj or .ply files",
+            expected=f"{', '.join((*_READERS, *_USD))} or a folder of .obj or .ply files",
             fix="Export the vertices in one of these formats.",
         )
     return reader(path)

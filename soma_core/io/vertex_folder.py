@@ -57,5 +57,5 @@ class FolderSequence(VertexSequence):
 
 def _natural(file: Path) -> list[tuple[int, int | str]]:
     """Sorting key in which numbers count as numbers."""
-    parts = re.split(r"(\d+)", file.name)
-    return [(0, int(part)) if part.isdigit() else (1, part) for part in parts if part]
+    parts = re.split(r"([0-9]{1,18})", file.name)  # other digits, such as ², are no numbers to Python
+    return [(0, int(part)) if part.isascii() and part.isdigit() else (1, part) for part in parts if part]

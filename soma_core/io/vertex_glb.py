@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import struct
 from collections.abc import Callable
 from pathlib import Path
@@ -18,6 +19,9 @@ from soma_core.io.vertex_sequence import VertexSequence, even_rate
 __all__ = ["GlbSequence"]
 
 _Result = TypeVar("_Result")
+
+_MOST_TRANSFORMS = 400_000
+"""Of nodes at times, in memory at once."""
 
 _DAMAGE = (KeyError, IndexError, TypeError, ValueError, AttributeError, RecursionError, struct.error)
 
@@ -102,8 +106,10 @@ class _MovingMesh:
             self._read_skin(file, document["skins"][document["nodes"][node]["skin"]], primitive, kept)
 
     def _read_skin(self, file: GlbFile, skin: dict[str, Any], primitive: dict[str, Any], kept: slice) -> None:
-        self._joints = np.array(skin["joints"])
+        self._joints = np.array(skin["joints"], np.int64)
         count = len(self._joints)
+        if count and not 0 <= self._joints.min() <= self._joints.max() < len(file.document["nodes"]):
+            raise ValueError("its skin has joints that are no nodes")
         inverse = np.tile(np.eye(4), (count, 1, 1))
         if "inverseBindMatrices" in skin:
             inverse = file.accessor(skin["inverseBindMatrices"]).astype(np.float64)
@@ -113,6 +119,8 @@ class _MovingMesh:
         for name, index in primitive["attributes"].items():
             if name.startswith("JOINTS_"):
                 ids = file.accessor(index)[kept].astype(np.int64).ravel()
+                if len(ids) and ids.max() >= count:
+                    raise ValueError(f"its skin has {count} joints, and vertices that hang on others")
                 values = file.fractions(primitive["attributes"][name.replace("JOINTS", "WEIGHTS")])[kept]
                 pairs = (values.astype(np.float64).ravel(), (rows, ids))
                 self._weights = self._weights + scipy.sparse.csr_array(pairs, shape=self._weights.shape)
@@ -121,9 +129,11 @@ class _MovingMesh:
     def at(self, tracks: NodeTracks, times: np.ndarray) -> np.ndarray:
         """World positions (times, vertices, 3) float32."""
         morphs = tracks.weights(self._node, times, len(self._targets))
-        worlds = tracks.worlds(times)
+        nodes = [self._node, *map(int, self._joints)]
         found = np.empty((len(times), self.vertex_count, 3), np.float32)
-        for frame, world in enumerate(worlds):
+        some = max(_MOST_TRANSFORMS // len(nodes), 1)
+        worlds = (tracks.worlds(times[at : at + some], nodes) for at in range(0, len(times), some))
+        for frame, world in enumerate(itertools.chain.from_iterable(worlds)):
             rest = self._rest
             if len(self._targets):
                 rest = rest + np.tensordot(morphs[frame], self._targets, 1)
@@ -131,10 +141,10 @@ class _MovingMesh:
         return found
 
     def _placed(self, rest: np.ndarray, world: np.ndarray) -> np.ndarray:
-        """Put vertices into the world by the skin, where there is one, else by the node."""
+        """Put vertices into the world by the skin, if there is one, else by the node, which comes first."""
         if not len(self._joints):
-            return rest @ world[self._node, :3, :3].T + world[self._node, :3, 3]
-        transforms = world[self._joints] @ self._inverse_bind
+            return rest @ world[0, :3, :3].T + world[0, :3, 3]
+        transforms = world[1:] @ self._inverse_bind
         blended = (self._weights @ transforms[:, :3].reshape(-1, 12)).reshape(-1, 3, 4)
         return np.einsum("vab,vb->va", blended[:, :, :3], rest) + blended[:, :, 3]
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -11,8 +9,11 @@ import numpy as np
 
 from soma_core.errors import AssetError, InputError
 from soma_core.io.vertex_sequence import VertexSequence, even_rate
+from soma_core.usd_stage import open_stage, usd_errors
 
 __all__ = ["UsdSequence"]
+
+_FIX = "Export it again."
 
 
 class UsdSequence(VertexSequence):
@@ -20,17 +21,18 @@ class UsdSequence(VertexSequence):
 
     Args:
         path: ``.usd``, ``.usda``, ``.usdc`` or ``.usdz``.
+        allow_references: follow references that lead out of the folder of the file.
 
     Raises:
-        AssetError: not a USD file.
+        AssetError: not a USD file, or one that refers to what may not be opened.
         InputError: no mesh or several that move, blend shapes with inbetweens, or samples at uneven times.
     """
 
-    def __init__(self, path: Path) -> None:
-        from pxr import Usd, UsdGeom
+    def __init__(self, path: Path, *, allow_references: bool = False) -> None:
+        from pxr import UsdGeom
 
-        with _usd_errors(path):
-            self._stage = Usd.Stage.Open(str(path))
+        self._stage: Any = open_stage(path, fix=_FIX, allow_references=allow_references)
+        with usd_errors(path, fix=_FIX):
             self._points, self._skin, times = _moving_mesh(path, self._stage)
             self._shapes = None if self._skin is None else _BlendShapes.of(path, *self._skin)
         self._times = times or [self._stage.GetStartTimeCode()]
@@ -45,7 +47,7 @@ class UsdSequence(VertexSequence):
         )
 
     def _read(self, start: int, stop: int) -> np.ndarray:
-        with _usd_errors(self.path):
+        with usd_errors(self.path, fix=_FIX):
             return np.stack([self._frame(time) for time in self._times[start:stop]])
 
     def _frame(self, time: float) -> np.ndarray:
@@ -130,15 +132,6 @@ class _BlendShapes:
             if weights[place]:
                 np.add.at(points, ids, weights[place] * offsets)
         return Vt.Vec3fArray.FromNumpy(points.astype(np.float32))
-
-
-@contextmanager
-def _usd_errors(path: Path) -> Iterator[None]:
-    """Name the file where USD fails: pxr raises Tf.ErrorException, a RuntimeError with C++ source lines."""
-    try:
-        yield
-    except RuntimeError as error:
-        raise AssetError(path, cause="not a readable USD file", fix="Export it again.") from error
 
 
 def _moving_mesh(path: Path, stage: Any) -> tuple[Any, Any, list[float]]:

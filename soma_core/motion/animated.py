@@ -28,8 +28,8 @@ from soma_core.motion.ground import (
 )
 from soma_core.motion.identities import kept_identity
 from soma_core.options import Contacts, FrameRange, Ground, Translation
-from soma_core.paths import assets_dir
 from soma_core.progress import progress
+from soma_core.rig.manifest import shipped_file
 
 if TYPE_CHECKING:
     from soma_core.animation.posed import Posed
@@ -83,7 +83,7 @@ def load_clip(
         SomaError: the file cannot be read.
         InputError: no frame is left.
     """
-    path = Path(path).expanduser() if path else assets_dir() / "motions/range_of_motion.npz"
+    path = Path(path).expanduser() if path else shipped_file("motions/range_of_motion.npz")
     motion, frames = read_motion(path, fps=fps, person=person), frames or FrameRange()
     part = slice(frames.start, frames.stop, frames.step)
     if part.step < 1 or not len(range(motion.frame_count)[part]):

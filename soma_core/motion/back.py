@@ -14,6 +14,7 @@ import torch
 from soma_core.cache import atomic_text
 from soma_core.errors import InputError
 from soma_core.io.amass import SMPL_JOINTS
+from soma_core.json_file import read_json
 from soma_core.motion.chunks import FittedChunks
 from soma_core.motion.converter import Converted, earlier_report
 from soma_core.motion.files import ResultFiles, fingerprint, layout_of, read
@@ -125,7 +126,7 @@ def _found_params(file: Path, target: SmplTarget | ParameterTarget, body: Played
     if not file.is_file():
         found = target.find(body)
         atomic_text(file, json.dumps({name: value[0].tolist() for name, value in found.items()}))
-    return dict(json.loads(file.read_text(encoding="utf-8")))
+    return dict(read_json(file, fix="Delete it."))
 
 
 def _convert_missing(body: Played, target: NativeTarget, kept: FittedChunks) -> None:

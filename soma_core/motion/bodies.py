@@ -90,6 +90,7 @@ def _vertex_body(path: Path, options: InvertOptions, backends: FitBackends) -> S
         fps=options.fps,
         unit=str(options.unit) if options.unit else None,
         up=f"+{options.up}" if options.up else None,
+        allow_references=options.allow_references,
     )
     try:
         if sequence.fps is None:

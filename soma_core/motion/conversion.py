@@ -6,6 +6,7 @@ import json
 import logging
 import shutil
 import tempfile
+import traceback
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -138,6 +139,24 @@ def _files(folder: Path) -> Iterator[Path]:
             yield file
 
 
+def _unforeseen(file: Path, error: Exception) -> SomaError:
+    """What was not foreseen, as a sentence that names the file and the module where it happened."""
+    _log.debug("%s", file, exc_info=error)
+    module = next(
+        (
+            name
+            for frame, _ in reversed([*traceback.walk_tb(error.__traceback__)])
+            if (name := str(frame.f_globals.get("__name__"))).startswith("soma_core.")
+        ),
+        __name__,
+    )
+    told = " ".join(str(error).split())[:200] or "no text"
+    return SomaError(
+        f"{file}: {module} failed in a way that was not foreseen ({type(error).__name__}: {told}). "
+        "Leave the file out, and report it with the file."
+    )
+
+
 def _row(
     convert: Converter | BackConverter, file: Path, out: Path, name: str, found: FolderConverted
 ) -> tuple[Mapping[str, Any], str]:
@@ -147,9 +166,10 @@ def _row(
             found.skipped.append(name)
             return {"state": "skipped", "reason": "holds no motion"}, "holds no motion"
         converted = convert(file, ResultFiles.mirrored(out, name), out / "chunks" / name)
-    except SomaError as error:
-        found.errors[name] = error
-        return {"state": "failed", "reason": str(error)}, str(error)
+    except Exception as error:  # one file never ends a batch
+        refusal = error if isinstance(error, SomaError) else _unforeseen(file, error)
+        found.errors[name] = refusal
+        return {"state": "failed", "reason": str(refusal)}, str(refusal)
     found.converted[name] = converted
     report = converted.report
     row = {"state": "converted", "layout": report["settings"]["layout"], "frames": report["frames"],

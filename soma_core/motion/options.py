@@ -9,9 +9,9 @@ from soma_core.motion.writers import MESH_WRITERS, WriteOptions
 from soma_core.options import (
     BackendChoice,
     BodyGender,
-    Contacts,
     BoneMatch,
     Carry,
+    Contacts,
     ConvertResult,
     FitLod,
     Ground,
@@ -79,10 +79,12 @@ class InvertOptions(FitOptions):
 
     Attributes:
         topology: which mesh they are vertices of; ``auto`` tells it by their number.
+        allow_references: let a USD file refer to what lies outside of its folder.
     """
 
     backend: BackendChoice = field(default_factory=lambda: BackendChoice(name="soma"))
     topology: Topology = Topology.auto
+    allow_references: bool = False
 
 
 @dataclass(kw_only=True)

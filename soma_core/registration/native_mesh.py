@@ -11,8 +11,8 @@ import numpy as np
 import torch
 
 from soma_core.backends.parameters import batch_parameters
-from soma_core.errors import AssetError, InputError
-from soma_core.io.mesh_vertices import read_mesh_vertices
+from soma_core.errors import InputError
+from soma_core.io.mesh_vertices import read_mesh_vertices, read_ply_triangles
 from soma_core.obj import read_obj
 from soma_core.plugin.registry import Registry
 from soma_core.plugin.spec import HasTriangles
@@ -89,13 +89,5 @@ def read_native_mesh(path: Path) -> NativeMesh:
             "native", got=f"the suffix {path.suffix!r}", expected=".obj or .ply", fix="Export it as OBJ."
         )
     vertices = read_mesh_vertices(path)
-    return NativeMesh(vertices=vertices, triangles=_ply_triangles(path, vertices), name=f"{path.stem}.obj")
-
-
-def _ply_triangles(path: Path, vertices: np.ndarray) -> np.ndarray:
-    import trimesh
-
-    loaded = trimesh.load(path, process=False, maintain_order=True)
-    if not isinstance(loaded, trimesh.Trimesh) or len(loaded.vertices) != len(vertices):
-        raise AssetError(path, cause="holds no faces", fix="Export the mesh with its faces, as OBJ.")
-    return np.asarray(loaded.faces, np.int64)
+    triangles = read_ply_triangles(path, len(vertices))
+    return NativeMesh(vertices=vertices, triangles=triangles, name=f"{path.stem}.obj")

@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from soma_core.errors import AssetError
-from soma_core.files import refuse_unreadable
 from soma_core.rig.expansion import public_rig, with_helpers
 from soma_core.rig.influences import read_weights
 from soma_core.rig.manifest import RESTORE
@@ -19,6 +18,7 @@ from soma_core.rig.procedural import ProceduralDefinition
 from soma_core.rig.skeleton import Rig
 from soma_core.rig.stored import StoredRig
 from soma_core.rig.transforms import world_transforms
+from soma_core.usd_stage import open_stage, usd_errors
 
 if TYPE_CHECKING:
     from pxr import Usd, UsdSkel
@@ -69,27 +69,6 @@ class _Skeleton:
     parents: np.ndarray
     bind_world: np.ndarray
     t_pose_world: np.ndarray
-
-
-def _open(path: Path) -> Usd.Stage:
-    from pxr import Tf, Usd
-
-    refuse_unreadable(path, fix=RESTORE)
-    try:
-        return Usd.Stage.Open(str(path))
-    except Tf.ErrorException as error:
-        cause = f"USD cannot read it ({_last_line(error)})"
-        fix = "Restore the file; a text layer that ends early was truncated"
-        raise AssetError(path, cause=cause, fix=fix) from error
-
-
-def _last_line(error: Exception) -> str:
-    """What USD says at last; its text cannot always be decoded."""
-    try:
-        lines = [line.strip() for line in str(error).splitlines() if line.strip()]
-    except UnicodeDecodeError:
-        lines = []
-    return lines[-1] if lines else "no reason given"
 
 
 def _columns(matrix: object) -> np.ndarray:
@@ -295,11 +274,13 @@ def read_usd_rig(
             weights that are negative, not finite, do not sum to 1 or name unknown joints, or a skeleton
             without a joint of the definition.
     """
-    stage = _open(path)
-    skin = _choose_mesh(path, stage, mesh, lod)
-    stored = _read_stored(path, stage, skin)
-    indices, counts = _polygons(path, skin, len(stored.bind_shape))
-    uv, uv_indices = _texture(skin, len(indices))
+    fix = f"{RESTORE}; a text layer that ends early was truncated"
+    stage = open_stage(path, fix=fix)
+    with usd_errors(path, fix=fix):
+        skin = _choose_mesh(path, stage, mesh, lod)
+        stored = _read_stored(path, stage, skin)
+        indices, counts = _polygons(path, skin, len(stored.bind_shape))
+        uv, uv_indices = _texture(skin, len(indices))
     public = stored if definition is None else public_rig(path, stored, definition)
     digest = public.digest(_fan_triangles(indices, counts) if triangles is None else triangles)
     rig = public.metric(digest)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import logging
 from collections.abc import Sequence
 from pathlib import Path
@@ -11,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 from omegaconf import OmegaConf
 
 from soma_core.errors import AssetError, InputError
+from soma_core.json_file import read_json
 from soma_core.options import BackendChoice
 from soma_core.plugin.registry import default_registry
 from soma_core.plugin.spec import WrapPair
@@ -97,29 +97,37 @@ def _options(config: DictConfig, native: NativeMesh) -> WrapOptions:
             )
         known[key] = value or known.get(key)
     known["unit"] = str(config.unit) if config.unit else known.get("unit")
-    landmarks = _json(config.landmarks, dict, '{"canonical vertex id": native vertex id}')
+    landmarks = {} if config.landmarks is None else read_landmarks(config.landmarks)
     masked = _json(config.mask, list, "a list of native vertex ids")
     return WrapOptions(
         **known,
         fill=tuple(config.fill),
         symmetric=config.symmetric,
-        landmarks={int(key): int(value) for key, value in landmarks.items()},
+        landmarks=landmarks,
         masked=[int(value) for value in masked],
     )
 
 
-def _json(name: str | None, kind: type, expected: str) -> Any:
+def read_landmarks(name: str | Path) -> dict[int, int]:
+    """Canonical vertex id -> native vertex id, of a JSON file.
+
+    Raises:
+        AssetError: missing, or something else.
+    """
+    found = _json(name, dict, '{"canonical vertex id": native vertex id}')
+    return {int(key): int(value) for key, value in found.items()}
+
+
+def _json(name: str | Path | None, kind: type, expected: str) -> Any:
     """Content of a JSON file of integers, empty where none is named."""
     if name is None:
         return kind()
     path = Path(name).expanduser()
+    content = read_json(path, fix=f"Write {expected} as JSON.")
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
         items = [*content, *content.values()] if isinstance(content, dict) else content
         whole = isinstance(content, kind) and all(int(item) == float(item) for item in items)
-    except OSError as error:
-        raise AssetError(path, cause=f"cannot be read ({error.strerror})", fix="Correct the path.") from error
-    except (ValueError, TypeError):
+    except (ValueError, TypeError, OverflowError):
         whole = False
     if not whole:
         raise AssetError(path, cause=f"does not hold {expected}", fix="Write it as JSON.")

@@ -1,59 +1,75 @@
-"""Guards: code that runs, readers that hang, and memory."""
+"""One process, which answers for one file after the other: a crash is a finding, no end."""
 
 from __future__ import annotations
 
-import signal
+import json
+import select
+import subprocess
 import sys
-import tracemalloc
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator
+from pathlib import Path
 
 import pytest
 
-from tests.hostile.corpus import SENTINEL
+PATIENCE = 120
+"""Seconds on the clock after which a reader counts as hanging; the machine may be busy with others."""
 
-PATIENCE = 60
-"""Seconds after which a reader counts as hanging; none takes more than two."""
+MOST_SECONDS = 5
+"""Of computing, for any file."""
 
-MOST_MEMORY = 384 * 2**20
-"""Bytes that a reader may hold for a hostile file: below what any of the bombs unfolds to."""
-
-_watched: list[str] = []
-_EVENTS = ("os.system", "subprocess.Popen", "os.exec", "pickle.find_class")
+MOST_MEMORY = 2**30
+"""Bytes that a reader may take for a hostile file."""
 
 
-def _audit(event: str, _: object) -> None:
-    if event in _EVENTS:
-        _watched.append(event)
+class _Child:
+    """One process; it is started again after it died."""
+
+    def __init__(self, folder: Path) -> None:
+        self._folder, self._process = folder, None
+
+    def ask(self, reader: str, name: str) -> dict:
+        """What became of a file, by its name in the corpus or as a mutation."""
+        if self._process is None:
+            self._process = subprocess.Popen(
+                [sys.executable, "-m", "tests.hostile.child", str(self._folder)], stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True, bufsize=1,
+            )  # fmt: skip
+        self._process.stdin.write(f"{reader}\t{name}\n")
+        self._process.stdin.flush()
+        if not select.select([self._process.stdout], [], [], PATIENCE)[0]:
+            self.stop()
+            pytest.fail(f"still reading after {PATIENCE} s")
+        line = self._process.stdout.readline()
+        if not line:
+            code = self._process.wait()
+            self.stop()
+            pytest.fail(f"the process ended with code {code}")
+        return json.loads(line)
+
+    def stop(self) -> None:
+        """End the process."""
+        if self._process is not None:
+            self._process.kill()
+            self._process.wait()
+            self._process.stdin.close()
+            self._process.stdout.close()
+        self._process = None
 
 
-sys.addaudithook(_audit)
+@pytest.fixture(scope="package")
+def ask(tmp_path_factory) -> Iterator[Callable[[str, str], str | None]]:
+    """Let a reader read a file: what it said, None for a value; anything else fails the test."""
+    child = _Child(tmp_path_factory.mktemp("hostile"))
 
+    def asked(reader: str, name: str) -> str | None:
+        found = child.ask(reader, name)
+        assert not found["executed"], f"{name} ran code"
+        assert not found["events"], f"{name} led to {found['events']}"
+        told = found["told"]
+        assert not (told or "").startswith("FOREIGN"), f"{name}: {told}"
+        assert found["seconds"] < MOST_SECONDS, f"{name} took {found['seconds']:.1f} s of computing"
+        assert found["bytes"] < MOST_MEMORY, f"{name} took {found['bytes'] >> 20} MiB"
+        return told
 
-@contextmanager
-def _guard() -> Iterator[None]:
-    def give_up(*_: object) -> None:
-        raise TimeoutError(f"still reading after {PATIENCE} s")
-
-    before = signal.signal(signal.SIGALRM, give_up)
-    signal.alarm(PATIENCE)
-    _watched.clear()
-    tracemalloc.start()
-    try:
-        yield
-        peak = tracemalloc.get_traced_memory()[1]
-    finally:
-        tracemalloc.stop()
-        signal.alarm(0)
-        signal.signal(signal.SIGALRM, before)
-    assert not _watched, f"reading led to {_watched}"
-    assert peak < MOST_MEMORY, f"reading took {peak >> 20} MiB"
-
-
-@pytest.fixture
-def guarded(tmp_path, monkeypatch):
-    """A context in which nothing may run code, hang or take much memory; the current folder is empty."""
-    (tmp_path / "current").mkdir()
-    monkeypatch.chdir(tmp_path / "current")
-    yield _guard
-    assert not (tmp_path / "current" / SENTINEL).exists()
+    yield asked
+    child.stop()

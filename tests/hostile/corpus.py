@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
+from tests.hostile.bombs import instances, made
 from tests.hostile.readers import USD, glb_bytes
 from tests.standins.pickles import Instance, ch, csc, write_pickle
 
@@ -91,6 +92,7 @@ def _structured_pickles() -> Iterator[tuple[str, bytes]]:
         ("pickle of chumpy with code", Instance("chumpy.ch", "Ch", {"x": _touches()})),
         ("pickle of other chumpy", Instance("chumpy.ch", "MatVecMult", {})),
         ("pickle of NaN", np.array([np.nan])),
+        *instances(),
     ):
         path = folder / f".{name}"
         try:
@@ -310,7 +312,8 @@ def _plain() -> Iterator[tuple[str, bytes]]:
 
 def _all() -> dict[str, bytes | Callable[[], bytes]]:
     found: dict[str, bytes | Callable[[], bytes]] = {"npz bomb": _bomb}
-    for part in (_plain, _pickles, _structured_pickles, _arrays, _archives, _meshes, _scenes, _skeletons):
+    parts = (_plain, _pickles, _structured_pickles, _arrays, _archives, _meshes, _scenes, _skeletons, made)
+    for part in parts:
         found.update(part())
     return found
 

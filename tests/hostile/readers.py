@@ -10,22 +10,26 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 from soma_backend_garment import _point_pca as garment
 from soma_backend_smpl._model_file import read_model
 from soma_backend_smpl.family import SMPL
 
 from assets.make.twist_template import procedural_document
 from soma_core.backends.native import component_count
+from soma_core.correctives.weights import read_weights
 from soma_core.io import open_vertex_sequence, read_amass, read_motion
-from soma_core.io.mesh_vertices import read_mesh_vertices
+from soma_core.io.mesh_vertices import read_mesh_vertices, read_ply_triangles
 from soma_core.io.pickled_arrays import read_pickled_arrays
 from soma_core.io.sam3d import read_sam3d
 from soma_core.io.skeleton_files import read_skeleton
+from soma_core.io.torch_file import read_torch_arrays
 from soma_core.obj import read_obj
 from soma_core.rig.manifest import MANIFEST_NAME, read_manifest
 from soma_core.rig.neutral import load_shape_space, read_topology
 from soma_core.rig.procedural_json import read_procedural
 from soma_core.rig.usd import read_usd_rig
+from soma_core.tasks.wrap import read_landmarks
 from tests.standins.pickles import ch, csc, select, write_pickle
 
 __all__ = ["READERS", "Reader"]
@@ -110,6 +114,24 @@ def _obj(path: Path) -> None:
 def _ply(path: Path) -> None:
     head = "ply\nformat binary_little_endian 1.0\nelement vertex 5\nproperty float x\nproperty float y\n"
     path.write_bytes((head + "property float z\nend_header\n").encode() + _vertices()[0].tobytes())
+
+
+def _ply_faces(path: Path) -> None:
+    _ply(path)
+    head, _, body = path.read_bytes().partition(b"end_header")
+    faces = struct.pack("<B3iB4i", 3, 0, 1, 2, 4, 0, 2, 3, 4)
+    head += b"element face 2\nproperty list uchar int vertex_indices\nend_header"
+    path.write_bytes(head + body + faces)
+
+
+def _torch(path: Path) -> None:
+    numbers = torch.arange(24.0).reshape(2, 3, 4)
+    content = {"poses": numbers, "half": numbers.half(), "list": [1, "text", numbers[0].T], 3: (None, True)}
+    torch.save({**content, "weights": torch.nn.Linear(2, 3).state_dict()}, path)
+
+
+def _landmarks(path: Path) -> None:
+    path.write_text(json.dumps({"12": 7, "400": 31}))
 
 
 def _glb(path: Path) -> None:
@@ -220,8 +242,21 @@ READERS = [
             "obj of no faces", "obj of NaN", "obj of infinity",
         ),
     ),
-    Reader(name="mesh ply", suffix=".ply", read=read_mesh_vertices, good=_ply),
-    Reader(name="vertex folder", suffix=".ply", read=_folder, good=_ply),
+    Reader(
+        name="faces ply", suffix=".ply", read=lambda path: read_ply_triangles(path, FRAMES + 2),
+        good=_ply_faces, accepts=("ply with a texture elsewhere",),
+    ),
+    Reader(name="torch file", suffix=".pt", read=read_torch_arrays, good=_torch),
+    Reader(name="correctives", suffix=".pt", read=read_weights),
+    Reader(name="landmarks", suffix=".json", read=read_landmarks, good=_landmarks),
+    Reader(
+        name="mesh ply", suffix=".ply", read=read_mesh_vertices, good=_ply,
+        accepts=("ply with a texture elsewhere",),
+    ),
+    Reader(
+        name="vertex folder", suffix=".ply", read=_folder, good=_ply,
+        accepts=("ply with a texture elsewhere",),
+    ),
     Reader(
         name="vertices npz", suffix=".npz", read=_frames,
         good=lambda path: _write_npz(path, vertices=_vertices()), accepts=("npz of NaN",),

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+import re
+
 import pytest
 
-from soma_core.errors import SomaError
 from tests.hostile.corpus import FILES, LINKS
 from tests.hostile.readers import READERS
 
 each_reader = pytest.mark.parametrize("reader", READERS, ids=lambda reader: reader.name)
-KINDS = {".npy": "array", ".usdz": "npz", ".pkl": "pickle", ".pca": "point.pca", ".json": "JSON"}
+KINDS = {".npy": "array", ".usdz": "npz", ".pkl": "pickle", ".pca": "point.pca", ".json": "JSON", ".pt": "pt"}
 """Suffix -> first word of the names of hostile files of that format, where it is not the suffix."""
 
 FOR_ALL = (
@@ -34,35 +35,27 @@ PAIRS = [
 
 
 @pytest.mark.parametrize(("reader", "name"), PAIRS)
-def test_hostile_files_are_refused(reader, name, tmp_path, guarded):
-    path = tmp_path / f"hostile{reader.suffix}"
-    content = FILES[name]
-    path.write_bytes(content if isinstance(content, bytes) else content())
-    with guarded():
-        if name in reader.accepts:
-            reader.read(path)
-            return
-        with pytest.raises(SomaError, match=r"(hostile|MANIFEST)[^ ]*: ?\S") as caught:
-            reader.read(path)
-    assert len(str(caught.value)) < 2000
+def test_hostile_files_are_refused(reader, name, ask):
+    told = ask(reader.name, name)
+    if name in reader.accepts:
+        return
+    assert told is not None, "was read"
+    assert re.search(r"(hostile|MANIFEST)[^ ]*: ?\S", told)
+    assert len(told) < 2000
 
 
 @each_reader
 @pytest.mark.parametrize("name", LINKS)
-def test_what_is_no_file_is_refused(reader, name, tmp_path, guarded):
-    path = tmp_path / f"hostile{reader.suffix}"
-    LINKS[name](path)
-    with guarded(), pytest.raises(SomaError, match=r"hostile|MANIFEST"):
-        reader.read(path)
+def test_what_is_no_file_is_refused(reader, name, ask):
+    assert re.search("hostile|MANIFEST", ask(reader.name, name) or "was read")
 
 
 @each_reader
-def test_links_to_good_files_are_followed(reader, tmp_path, guarded):
+def test_links_to_good_files_are_followed(reader, tmp_path):
     if reader.good is None:
         pytest.skip("no small file of this kind")
     good = tmp_path / f"good{reader.suffix}"
     reader.good(good)
     link = tmp_path / f"hostile{reader.suffix}"
     link.symlink_to(good)
-    with guarded():
-        reader.read(link)
+    reader.read(link)

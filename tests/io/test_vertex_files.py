@@ -11,6 +11,8 @@ import pytest
 from soma_core.errors import AssetError, InputError
 from soma_core.io import open_vertex_sequence
 from soma_core.io.gltf import write_gltf
+from soma_core.io.mesh_vertices import read_mesh_vertices, read_ply_triangles
+from soma_core.obj import read_obj
 
 FILE_TOLERANCE_MM = 0.01
 """Float32 positions within four metres of the origin, skinned in float32."""
@@ -377,9 +379,9 @@ def test_a_glb_of_another_kind_says_why(tmp_path, vertices, changes, said):
 @pytest.mark.parametrize(
     ("accessor", "said"),
     [
-        ({"count": 10**12}, "strides is incompatible|too small"),
+        ({"count": 10**12}, "leaves its part of the file"),
         ({"sparse": {}}, "KeyError"),
-        ({"bufferView": None, "count": 10**12}, "take 12000000000000 bytes|NoneType"),
+        ({"bufferView": None, "count": 10**12}, "NoneType"),
         ({"bufferView": 9}, "IndexError"),
         ({"componentType": 1}, "KeyError"),
     ],
@@ -467,3 +469,45 @@ def test_a_glb_that_is_cut_off_is_named(tmp_path, vertices):
     (tmp_path / "a.glb").write_bytes(content[:16] + b"SPAM" + content[20:])
     with pytest.raises(AssetError, match=r"a\.glb: .*first chunk is b'SPAM'"):
         open_vertex_sequence(tmp_path / "a.glb")
+
+
+@pytest.mark.parametrize("order", ["ascii", "binary_little_endian", "binary_big_endian"])
+def test_faces_of_a_ply_are_fans_in_order(tmp_path, order):
+    faces, head = [(0, 1, 2), (0, 2, 3, 4)], f"ply\nformat {order} 1.0\ncomment TextureFile /dev/zero\n"
+    head += "element vertex 5\nproperty float x\nproperty float y\nproperty float z\nelement face 2\n"
+    head += "property uchar flags\nproperty list uchar int vertex_indices\nproperty float area\nend_header\n"
+    points, sign = np.arange(15, dtype="f4").reshape(5, 3), ">" if "big" in order else "<"
+    if order == "ascii":
+        rows = [" ".join(map(str, row)) for row in points.tolist()]
+        rows += [f"7 {len(face)} {' '.join(map(str, face))} 0.5" for face in faces]
+        body = ("\n".join(rows) + "\n").encode()
+    else:
+        body = points.astype(f"{sign}f4").tobytes()
+        body += b"".join(struct.pack(f"{sign}BB{len(face)}if", 7, len(face), *face, 0.5) for face in faces)
+    path = tmp_path / "a.ply"
+    path.write_bytes(head.encode() + body)
+    np.testing.assert_array_equal(read_ply_triangles(path, 5), [[0, 1, 2], [0, 2, 3], [0, 3, 4]])
+    np.testing.assert_array_equal(read_mesh_vertices(path), points)
+    with pytest.raises(AssetError, match=r"a\.ply: has faces of others than its 4 vertices"):
+        read_ply_triangles(path, 4)
+    path.write_bytes((head.encode() + body)[:-12])
+    with pytest.raises(AssetError, match=r"a\.ply: no readable faces"):
+        read_ply_triangles(path, 5)
+
+
+def test_numbers_of_other_scripts_in_names_are_no_numbers(tmp_path):
+    for name in ("²1.obj", "f10.obj", "f2.obj", "٣.obj", "f" + "9" * 200 + ".obj"):
+        (tmp_path / name).write_text("v 0 0 0\nv 1 0 0\n")
+    with open_vertex_sequence(tmp_path) as sequence:
+        names = [file.name for file in sequence._files]
+    assert names.index("f2.obj") < names.index("f10.obj")
+
+
+def test_an_obj_takes_little_more_than_its_numbers(tmp_path):
+    path, count = tmp_path / "a.obj", 20_000
+    path.write_text("v 0.25 0.5 0.75\n" * count + "f 1 2 3\n" * count)
+    tracemalloc.start()
+    read_obj(path)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 4 * 48 * count  # 48 bytes of result a pair of lines, twice while it is copied

@@ -106,7 +106,7 @@ def test_inbetweens_of_blend_shapes_are_refused(tmp_path, clip):
 
 def test_what_is_no_usd_is_named(tmp_path):
     (tmp_path / "a.usdc").write_bytes(b"not a stage")
-    with pytest.raises(AssetError, match=r"a\.usdc: not a readable USD file"):
+    with pytest.raises(AssetError, match=r"a\.usdc: USD cannot read it"):
         open_vertex_sequence(tmp_path / "a.usdc")
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import hashlib
+import io
 import logging
 import warnings
 from collections.abc import Callable
@@ -14,7 +16,7 @@ from torch import Tensor
 
 from soma_backend_mhr._files import EXPRESSIONS, IDENTITY, JOINTS, LOD1, LOD6, PARAMETERS, VERTEX_COUNTS, Lod
 from soma_core import AssetError
-from soma_core.plugin import file_sha256, refuse_unreadable
+from soma_core.plugin import refuse_unreadable
 
 __all__ = ["Model", "load_model"]
 
@@ -58,22 +60,23 @@ def load_model(path: Path, lod: Lod, *, device: torch.device, dtype: torch.dtype
             another unit or other axes.
     """
     refuse_unreadable(path, fix=_where(lod), most_bytes=_MOST_BYTES)
-    _check_hash(path, lod, trust=trust)
+    content = path.read_bytes()  # what is opened is what was hashed, whatever becomes of the file meanwhile
+    _check_hash(path, content, lod, trust=trust)
     try:
-        model = _loaded(path, lod, device, dtype)
+        model = _loaded(path, content, lod, device, dtype)
     except RuntimeError as error:
         if dtype == torch.float32:
             raise _failed(path, lod, error) from error
         _log.info("%s does not compute in %s (%s); it computes in float32", path.name, dtype, _first(error))
         try:
-            model = _loaded(path, lod, device, torch.float32)
+            model = _loaded(path, content, lod, device, torch.float32)
         except RuntimeError as again:
             raise _failed(path, lod, again) from again
     return model
 
 
-def _check_hash(path: Path, lod: Lod, *, trust: bool) -> None:
-    found = file_sha256(path)
+def _check_hash(path: Path, content: bytes, lod: Lod, *, trust: bool) -> None:
+    found = hashlib.sha256(content).hexdigest()
     if found in lod.hashes:
         return
     other = next((each for each in (LOD1, LOD6) if found in each.hashes), None)
@@ -90,12 +93,12 @@ def _check_hash(path: Path, lod: Lod, *, trust: bool) -> None:
     _log.warning("%s is not the published file; opened because trust=true was given", path)
 
 
-def _loaded(path: Path, lod: Lod, device: torch.device, dtype: torch.dtype) -> Model:
+def _loaded(path: Path, content: bytes, lod: Lod, device: torch.device, dtype: torch.dtype) -> Model:
     with (
         warnings.catch_warnings()
     ):  # torch from 2.10 on advises another format; this one is what is published
         warnings.filterwarnings("ignore", "`torch.jit.load` is", DeprecationWarning)
-        module = torch.jit.load(str(path), map_location=device).eval().to(dtype)
+        module = torch.jit.load(io.BytesIO(content), map_location=device).eval().to(dtype)
     for parameter in module.parameters():
         parameter.requires_grad_(requires_grad=False)
     _check_signature(path, lod, module)
