@@ -13,20 +13,20 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import scipy.sparse
 
 from soma_core.errors import AssetError
-from soma_core.io.safe_pickle import Global, Record, read_pickle
+from soma_core.pickle_machine import Global, Record
+from soma_core.safe_pickle import read_pickle
+from soma_core.stored_matrix import StoredMatrix
 
-__all__ = ["read_pickled_arrays"]
+__all__ = ["RecordArrays", "read_pickled_arrays"]
 
 _PLAIN_DTYPE = re.compile(r"[fiub][1248]")
 _DEEPEST = 8
 """Levels of chumpy objects inside each other; the official files have two."""
 
 _MOST_AXES, _LONGEST_AXIS = 8, 2**40
-_MOST_DENSE = 2**24
-"""Entries of a sparse matrix made dense; the largest regressor has 0.6 million."""
+_SMALL, _MOST_EXPANSION = 256 * 2**20, 4
 
 
 def read_pickled_arrays(path: Path | str, keys: Iterable[str]) -> dict[str, np.ndarray]:
@@ -36,73 +36,97 @@ def read_pickled_arrays(path: Path | str, keys: Iterable[str]) -> dict[str, np.n
     is not looked at.
 
     Raises:
-        AssetError: as :func:`~soma_core.io.safe_pickle.read_pickle`; no dictionary; or a key that holds no
+        AssetError: as :func:`~soma_core.safe_pickle.read_pickle`; no dictionary; or a key that holds no
             array of numbers, which the cause names.
     """
     fix = "Get the file from the model's official site."
     content = read_pickle(path)
     if type(content) is not dict:
         raise AssetError(path, cause=f"holds a {type(content).__name__}, not named arrays", fix=fix)
-    found = {}
-    for key in keys:
-        if key not in content:
-            continue
+    arrays = RecordArrays(Path(path).stat().st_size)
+    try:
+        wanted = {key: content[key] for key in keys if key in content}
+        return {key: np.ascontiguousarray(array) for key, array in arrays.named(wanted).items()}
+    except ValueError as error:
+        raise AssetError(path, cause=str(error), fix=fix) from error
+
+
+class RecordArrays:
+    """Arrays of the records of one file, which may unfold to no more than four times its size.
+
+    Each record is made once; two that share their bytes count twice.
+    """
+
+    def __init__(self, file_size: int) -> None:
+        self._left = max(_SMALL, _MOST_EXPANSION * file_size)
+        self._known: dict[int, np.ndarray] = {}
+
+    def named(self, records: Mapping[str, Any]) -> dict[str, np.ndarray]:
+        """Array of each of the records.
+
+        Raises:
+            ValueError: no array of numbers, damaged, or too large; the text begins with the name.
+        """
+        return {key: self._refusing(value, f"{key}: no sound array ") for key, value in records.items()}
+
+    def array(self, record: Any) -> np.ndarray:
+        """Array of numbers that a record of numpy, scipy or chumpy stands for, in native byte order.
+
+        Raises:
+            ValueError: no array of numbers, damaged, or too large.
+        """
+        return self._refusing(record, "no sound array ")
+
+    def dense(self, matrix: StoredMatrix) -> np.ndarray:
+        """A sparse matrix with its zeros.
+
+        Raises:
+            ValueError: indices that leave it, or too large.
+        """
+        self._spend(math.prod(matrix.shape) * matrix.values.itemsize)
+        return matrix.dense()
+
+    def _refusing(self, record: Any, words: str) -> np.ndarray:
         try:
-            found[key] = np.ascontiguousarray(_array(content[key], _DEEPEST))
-        except (ValueError, TypeError, KeyError, IndexError, OverflowError, MemoryError) as error:
-            raise AssetError(path, cause=f"{key}: {_reason(error)}", fix=fix) from error
-    return found
+            return self._array(record, _DEEPEST)
+        except ValueError as error:
+            raise ValueError(f"{words}({error})") from error
+        except (TypeError, KeyError, IndexError, OverflowError, MemoryError) as error:
+            raise ValueError(f"{words}({error!r:.80})") from error
 
+    def _array(self, value: Any, depth: int) -> np.ndarray:
+        if depth == 0:
+            raise ValueError(f"more than {_DEEPEST} objects inside each other")
+        if type(value) is not Record:
+            raise ValueError(f"a {type(value).__name__}")
+        if id(value) not in self._known:
+            self._known[id(value)] = self._made(value, depth)
+        return self._known[id(value)]
 
-def _reason(error: Exception) -> str:
-    return f"no sound array ({error})" if type(error) is ValueError else f"no sound array ({error!r:.80})"
+    def _made(self, value: Record, depth: int) -> np.ndarray:
+        kind = _class(value)
+        if kind.name == "_reconstruct":
+            return self._numpy_array(*value.state[-4:])  # type: ignore[index]  # refused where there is none
+        if kind.name == "_frombuffer":
+            data, dtype, shape, order = value.arguments
+            return self._numpy_array(shape, dtype, order == "F", data)
+        if kind.name == "scalar":
+            dtype, data = value.arguments
+            return self._numpy_array((), dtype, False, data)  # noqa: FBT003 - the order of a pickled state
+        if kind.name.endswith("_matrix"):
+            return self._dense(kind.name[:3], _state(value), depth - 1)
+        if kind.name == "Ch":
+            return self._array(_state(value)["x"], depth - 1)
+        if kind.name == "Select":
+            return self._selected(_state(value), depth - 1)
+        raise ValueError(f"a {kind}")
 
+    def _spend(self, count: int) -> None:
+        self._left -= count
+        if self._left < 0:
+            raise ValueError("arrays that unfold to far more than the file holds")
 
-def _array(value: Any, depth: int) -> np.ndarray:
-    if depth == 0:
-        raise ValueError(f"more than {_DEEPEST} objects inside each other")
-    if type(value) is not Record:
-        raise ValueError(f"a {type(value).__name__}")
-    kind = _class(value)
-    if kind.name == "_reconstruct":
-        return _numpy_array(*value.state[-4:])  # type: ignore[index]  # refused where there is none
-    if kind.name == "_frombuffer":
-        data, dtype, shape, order = value.arguments
-        return _numpy_array(shape, dtype, order == "F", data)
-    if kind.name == "scalar":
-        dtype, data = value.arguments
-        return _numpy_array((), dtype, False, data)  # noqa: FBT003 - the order of a pickled state
-    if kind.name.endswith("_matrix"):
-        return _dense(kind.name[:3], _state(value), depth - 1)
-    if kind.name == "Ch":
-        return _array(_state(value)["x"], depth - 1)
-    if kind.name == "Select":
-        return _selected(_state(value), depth - 1)
-    raise ValueError(f"a {kind}")
-
-
-def _class(value: Record) -> Global:
-    """What the record is an instance of, or the function that makes it."""
-    return value.arguments[0] if value.function.name == "_reconstructor" else value.function
-
-
-def _state(value: Record) -> Mapping[Any, Any]:
-    state = value.state[0] if type(value.state) is tuple else value.state
-    if type(state) is not dict:
-        raise ValueError(f"a {_class(value)} without its values")
-    return state
-
-
-def _numpy_array(shape: Any, dtype: Any, fortran: Any, data: Any) -> np.ndarray:
-    kind, content = _dtype(dtype), _buffer(data)
-    sizes = _shape(shape)
-    if math.prod(sizes) * kind.itemsize != len(content):
-        raise ValueError(f"{len(content)} bytes for the shape {sizes} of {kind}")
-    array = np.frombuffer(content, kind).reshape(sizes, order="F" if fortran else "C")
-    return array.astype(kind.newbyteorder("="))
-
-
-def _shape(value: Any) -> tuple[int, ...]:
+    def _shape(value: Any) -> tuple[int, ...]:
     fits = type(value) is tuple and len(value) <= _MOST_AXES
     if not fits or not all(type(size) is int and 0 <= size <= _LONGEST_AXIS for size in value):
         raise ValueError("a shape that is none")
@@ -127,28 +151,3 @@ def _buffer(data: Any) -> bytes | memoryview:
     if type(data) is not memoryview:
         raise ValueError(f"a {type(data).__name__} of objects, not numbers")
     return data
-
-
-def _selected(state: Mapping[Any, Any], depth: int) -> np.ndarray:
-    values, index = _array(state["a"], depth).ravel(), _array(state["idxs"], depth)
-    if index.dtype.kind not in "iu" or (index.size and not 0 <= index.min() <= index.max() < len(values)):
-        raise ValueError(f"a selection that leaves its {len(values)} values")
-    shape = state.get("preferred_shape")
-    selected = values[index]
-    return selected if shape is None else selected.reshape(_shape(shape))
-
-
-def _dense(kind: str, state: Mapping[Any, Any], depth: int) -> np.ndarray:
-    rows, columns = _shape(state.get("_shape", state.get("shape")))
-    if rows * columns > _MOST_DENSE:
-        raise ValueError(f"a sparse matrix of {rows} x {columns}")
-    names = ("row", "col") if kind == "coo" else ("indices", "indptr")
-    data, first, second = (_array(state[name], depth) for name in ("data", *names))
-    if first.dtype.kind not in "iu" or second.dtype.kind not in "iu":
-        raise ValueError("a sparse matrix whose indices are no integers")
-    if kind == "coo":
-        return scipy.sparse.coo_matrix((data, (first, second)), shape=(rows, columns)).toarray()
-    make = scipy.sparse.csc_matrix if kind == "csc" else scipy.sparse.csr_matrix
-    matrix = make((data, first.astype(np.int64), second.astype(np.int64)), shape=(rows, columns))
-    matrix.check_format(full_check=True)
-    return matrix.toarray()

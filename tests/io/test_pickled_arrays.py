@@ -7,7 +7,7 @@ import pytest
 
 from soma_core.errors import AssetError
 from soma_core.io.pickled_arrays import read_pickled_arrays
-from soma_core.io.safe_pickle import read_pickle
+from soma_core.safe_pickle import read_pickle
 from tests.standins.pickles import Instance, ch, csc, select, write_pickle
 
 NUMBERS = np.random.default_rng(0).standard_normal((40, 3, 5))

@@ -1,35 +1,35 @@
-"""Read a pickle as plain data: no class is looked up, no function is called.
+"""The stack machine that a pickle is a program for, without the instructions that look up or call.
 
-A pickle is a program for a small stack machine. Of its instructions only those are known here that lay
-out data. Where the program names a class or a function, the name must be on a list, and all that is kept
-is a record of the name and what it would have been called with; :mod:`soma_core.io.pickled_arrays` makes
-arrays of the records it understands. Nothing is hashed or compared but texts and numbers, every length
-is checked against the file, and the number of instructions is bounded, so no program runs for long.
+Of the instructions only those are known here that lay out data. Where the program names a class or a
+function, the name must be on a list, and all that is kept is a record of the name and what it would have
+been called with. Nothing is hashed or compared but texts and small integers, every length is checked
+against the file, and the number of instructions is bounded, so no program runs for long.
 """
 
 from __future__ import annotations
 
 import codecs
 import mmap
+import re
 import struct
 import warnings
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any, NamedTuple
 
-from soma_core.errors import AssetError
-from soma_core.files import refuse_unreadable
-
-__all__ = ["ALLOWED_NAMES", "Global", "Record", "read_pickle"]
-
-MOST_BYTES = 600 * 2**20
-MOST_INSTRUCTIONS = 1_000_000
-"""The official files have some hundreds to some thousands."""
+__all__ = ["STORED", "Global", "Machine", "PickleRules", "Record", "RefusedPickleError"]
 
 _LONG_TEXT = 1024
 """Bytes from which on a string is left in the file until it is asked for."""
 
 _LONGEST_NUMBER = 64
+_LONGEST_NARROW = 2**20
+"""Bytes of text from which on it must be Latin-1: one wider character makes four bytes of each."""
+
+_WIDE = re.compile(rb"[\xc4-\xff]")
+"""First bytes, in UTF-8, of what lies beyond Latin-1."""
+
+_LARGEST_KEY, _MOST_KEYS = 2**31, 2**16
+"""Of integers as keys: Python hashes them to themselves, and thousands can be made to collide."""
 
 
 class Global(NamedTuple):
@@ -51,87 +51,65 @@ class Record:
         self.function, self.arguments, self.state = function, arguments, None
 
 
-_CORES = ("numpy.core", "numpy._core")
-_SPARSE = ("csc", "csr", "coo")
-ALLOWED_NAMES = frozenset(
-    {
-        Global("chumpy.ch", "Ch"),
-        Global("chumpy.reordering", "Select"),
-        Global("numpy", "ndarray"),
-        Global("numpy", "dtype"),
-        *(Global(f"{core}.multiarray", name) for core in _CORES for name in ("_reconstruct", "scalar")),
-        *(Global(f"{core}.numeric", "_frombuffer") for core in _CORES),
-        *(
-            Global(f"scipy.sparse.{module}", f"{kind}_matrix")
-            for kind in _SPARSE
-            for module in (kind, f"_{kind}")
-        ),
-        *(Global(module, name) for module in ("builtins", "__builtin__") for name in ("set", "object")),
-        Global("copyreg", "_reconstructor"),
-        Global("copy_reg", "_reconstructor"),
-        Global("_codecs", "encode"),
-    }
-)
-"""All that a body model's file may name; everything else ends the reading."""
+class RefusedPickleError(ValueError):
+    """Why this is nothing to read, said before it is known which file it is."""
 
 
-class _RefusedError(ValueError):
-    """Why this is no file to read, said before it is known which file it is."""
+class PickleRules(NamedTuple):
+    """What a pickle of one kind may hold.
 
-
-def read_pickle(path: Path | str) -> Any:
-    """Contents of a pickle of protocols 0 to 5 as None, bool, int, float, text, bytes, tuple, list, dict.
-
-    Strings of Python 2 are read as Latin-1; long ones come as a memoryview of the file. Sets come as
-    lists; everything else as a :class:`Record`.
-
-    Raises:
-        AssetError: missing, a git-LFS pointer, truncated, too large, or a pickle that names what is not in
-            `ALLOWED_NAMES` or has instructions that body models do not need.
+    `names` may be named; `purpose` says of what they are part; `stored` allows references to what lies
+    outside of the pickle, which come as records of :data:`STORED`.
     """
-    refuse_unreadable(path, fix="Check the path.", most_bytes=MOST_BYTES)
-    with open(path, "rb") as stream:
-        data = mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ)
-    try:
-        return _Machine(data).run()
-    except _RefusedError as error:
-        raise AssetError(
-            path,
-            cause=str(error),
-            fix="Nothing of it was run. Get the file from the model's official site.",
-        ) from error
-    except (IndexError, KeyError, TypeError, ValueError, struct.error, OverflowError, MemoryError) as error:
-        cause = f"is no sound pickle ({type(error).__name__})"
-        raise AssetError(path, cause=cause, fix="Fetch the file again.") from error
+
+    names: frozenset[Global]
+    purpose: str
+    stored: bool = False
+    most_instructions: int = 1_000_000
 
 
-class _Machine:
-    """The stack machine of a pickle, without the instructions that call."""
+STORED = Global("", "stored outside of the pickle")
 
-    def __init__(self, file: mmap.mmap) -> None:
+
+class _Ordered(dict[Any, Any]):
+    """A dictionary that the pickle makes by its class, and changes by what it calls its state."""
+
+
+_DICTIONARIES = (Global("collections", "OrderedDict"), Global("collections", "defaultdict"))
+_SETS = (Global("builtins", "set"), Global("__builtin__", "set"))
+
+
+class Machine:
+    """A pickle under way; `run` gives its contents, or the exceptions of Python for a damaged one."""
+
+    def __init__(self, file: mmap.mmap | bytes, rules: PickleRules) -> None:
         self._file, self._data, self._at = file, memoryview(file), 0
+        self._rules, self._integer_keys = rules, 0
         self._stack: list[Any] = []
         self._marks: list[int] = []
         self._memo: dict[int, Any] = {}
 
     def run(self) -> Any:
-        for _ in range(MOST_INSTRUCTIONS):
+        for _ in range(self._rules.most_instructions):
             code = self._take(1)[0]
             if code == ord("."):
                 return self._stack[-1]
             step = _STEPS.get(code)
             if step is None:
                 name = f"{chr(code)!r}" if 32 < code < 127 else f"{code:#04x}"
-                raise _RefusedError(f"is no pickle of plain data: instruction {name} at byte {self._at - 1}")
+                raise RefusedPickleError(
+                    f"is no pickle of plain data: instruction {name} at byte {self._at - 1}"
+                )
             step(self)
-        raise _RefusedError(f"is no body model: a pickle of more than {MOST_INSTRUCTIONS} instructions")
+        most = self._rules.most_instructions
+        raise RefusedPickleError(f"is not {self._rules.purpose}: a pickle of more than {most} instructions")
 
     # Reading
 
     def _take(self, count: int) -> memoryview:
         end = self._at + count
         if count < 0 or end > len(self._data):
-            raise _RefusedError(
+            raise RefusedPickleError(
                 f"is cut off: {count} bytes are wanted at byte {self._at} of {len(self._data)}"
             )
         taken = self._data[self._at : end]
@@ -141,7 +119,7 @@ class _Machine:
     def _line(self) -> bytes:
         end = self._file.find(b"\n", self._at)
         if end < 0:
-            raise _RefusedError(f"is cut off: a line has no end at byte {self._at}")
+            raise RefusedPickleError(f"is cut off: a line has no end at byte {self._at}")
         line = bytes(self._data[self._at : end])
         self._at = end + 1
         return line
@@ -161,7 +139,7 @@ class _Machine:
 
     def pop(self) -> Any:
         if self._marks and len(self._stack) <= self._marks[-1]:
-            raise _RefusedError("is no sound pickle: it takes a value that is not there")
+            raise RefusedPickleError("is no sound pickle: it takes a value that is not there")
         return self._stack.pop()
 
     def mark(self) -> None:
@@ -180,43 +158,65 @@ class _Machine:
     def append(self, items: list[Any]) -> None:
         target = self._stack[-1]
         if type(target) is not list:
-            raise _RefusedError(f"is no plain data: it appends to {_kind(target)}")
+            raise RefusedPickleError(f"is no plain data: it appends to {_kind(target)}")
         target.extend(items)
 
     def update(self, items: list[Any]) -> None:
         target = self._stack[-1]
-        if type(target) is not dict or len(items) % 2:
-            raise _RefusedError(f"is no plain data: it sets items of {_kind(target)}")
+        if type(target) not in (dict, _Ordered) or len(items) % 2:
+            raise RefusedPickleError(f"is no plain data: it sets items of {_kind(target)}")
         for key, value in zip(items[::2], items[1::2], strict=True):
             if type(key) not in (str, int):  # the hash of nested tuples can take for ever
-                raise _RefusedError(f"is no plain data: a key is {_kind(key)}")
+                raise RefusedPickleError(f"is no plain data: a key is {_kind(key)}")
+            if type(key) is int:
+                self._count_key(key)
             target[key] = value
+
+    def _count_key(self, key: int) -> None:
+        self._integer_keys += 1
+        if not -_LARGEST_KEY < key < _LARGEST_KEY or self._integer_keys > _MOST_KEYS:
+            raise RefusedPickleError(
+                f"is no plain data: more than {_MOST_KEYS} integers as keys, or one beyond {_LARGEST_KEY}"
+            )
 
     # What stands for classes and calls
 
     def name(self, module: Any, name: Any) -> None:
         if type(module) is not str or type(name) is not str:
-            raise _RefusedError(f"names a class by {_kind(module)} and {_kind(name)}")
-        if (module, name) not in ALLOWED_NAMES:
+            raise RefusedPickleError(f"names a class by {_kind(module)} and {_kind(name)}")
+        if (module, name) not in self._rules.names:
             shown = ascii(f"{module:.80}.{name:.80}")[1:-1]
-            raise _RefusedError(f"asks for {shown}, which is no part of a body model")
+            raise RefusedPickleError(f"asks for {shown}, which is no part of {self._rules.purpose}")
         self.push(Global(module, name))
 
     def call(self) -> None:
         arguments, function = self.pop(), self.pop()
         if type(function) is not Global or type(arguments) is not tuple:
-            raise _RefusedError(f"is no plain data: it calls {_kind(function)}")
-        self.push(Record(function, arguments))
+            raise RefusedPickleError(f"is no plain data: it calls {_kind(function)}")
+        if function in _SETS and all(type(values) is list for values in arguments):
+            self.push([value for values in arguments for value in values])
+            return
+        empty = function in _DICTIONARIES and not any(type(value) is not Global for value in arguments)
+        self.push(_Ordered() if empty else Record(function, arguments))
+
+    def stored(self) -> None:
+        if not self._rules.stored:
+            raise RefusedPickleError("is no pickle of plain data: it refers to something outside of it")
+        self.push(Record(STORED, (self.pop(),)))
 
     def build(self) -> None:
         state, target = self.pop(), self._stack[-1]
+        if type(target) is _Ordered:
+            return
         if type(target) is not Record:
-            raise _RefusedError(f"is no plain data: it changes {_kind(target)}")
+            raise RefusedPickleError(f"is no plain data: it changes {_kind(target)}")
         target.state = state
 
     # Memory of what was made before
 
     def put(self, index: int) -> None:
+        if not 0 <= index < self._rules.most_instructions:  # integers that collide would take for ever
+            raise RefusedPickleError(f"is no sound pickle: it remembers {index} values")
         self._memo[index] = self._stack[-1]
 
     def memoize(self) -> None:
@@ -240,7 +240,7 @@ class _Machine:
     def line_string(self) -> None:
         line = self._line().strip()
         if len(line) < 2 or line[:1] not in (b"'", b'"') or line[-1:] != line[:1]:
-            raise _RefusedError("is no sound pickle: a string is not in quotes")
+            raise RefusedPickleError("is no sound pickle: a string is not in quotes")
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # of escapes that newer versions of Python frown upon
             text = codecs.escape_decode(line[1:-1])[0]
@@ -260,7 +260,7 @@ class _Machine:
 
 def _parsed(line: bytes, kind: Callable[[bytes], Any]) -> Any:
     if len(line) > _LONGEST_NUMBER:
-        raise _RefusedError(f"holds a number of {len(line)} digits")
+        raise RefusedPickleError(f"holds a number of {len(line)} digits")
     return kind(line.strip().removesuffix(b"L"))
 
 
@@ -268,59 +268,65 @@ def _kind(value: Any) -> str:
     return str(value) if type(value) is Global else f"a {type(value).__name__}"
 
 
-def _bytes(layout: str) -> Callable[[_Machine], None]:
+def _bytes(layout: str) -> Callable[[Machine], None]:
     return lambda machine: machine.push(machine._take(machine.number(layout)))
 
 
-def _text(layout: str) -> Callable[[_Machine], None]:
+def _text(layout: str) -> Callable[[Machine], None]:
     return lambda machine: machine.push(machine.text(machine.number(layout)))
 
 
-def _unicode(layout: str) -> Callable[[_Machine], None]:
-    return lambda machine: machine.push(str(machine._take(machine.number(layout)), "utf-8", "surrogatepass"))
+def _unicode(layout: str) -> Callable[[Machine], None]:
+    return lambda machine: machine.push(_decoded(machine._take(machine.number(layout))))
 
 
-def _number(layout: str) -> Callable[[_Machine], None]:
+def _decoded(text: memoryview) -> str:
+    if len(text) >= _LONGEST_NARROW and _WIDE.search(text):
+        raise RefusedPickleError(f"holds a text of {len(text)} bytes, which are no array")
+    return str(text, "utf-8", "surrogatepass")
+
+
+def _number(layout: str) -> Callable[[Machine], None]:
     return lambda machine: machine.push(machine.number(layout))
 
 
-def _long(layout: str) -> Callable[[_Machine], None]:
+def _long(layout: str) -> Callable[[Machine], None]:
     return lambda machine: machine.push(
         int.from_bytes(machine._take(machine.number(layout)), "little", signed=True)
     )
 
 
-def _constant(value: object) -> Callable[[_Machine], None]:
+def _constant(value: object) -> Callable[[Machine], None]:
     return lambda machine: machine.push(value)
 
 
-def _discard_mark(machine: _Machine) -> None:
+def _discard_mark(machine: Machine) -> None:
     machine.pop_mark()
 
 
-def _dictionary(machine: _Machine) -> None:
+def _dictionary(machine: Machine) -> None:
     items = machine.pop_mark()
     machine.push({})
     machine.update(items)
 
 
-def _set_item(machine: _Machine) -> None:
+def _set_item(machine: Machine) -> None:
     value, key = machine.pop(), machine.pop()
     machine.update([key, value])
 
 
-_STEPS: dict[int, Callable[[_Machine], object]] = {
+_STEPS: dict[int, Callable[[Machine], object]] = {
     ord(code): step
     for code, step in {
         "\x80": lambda m: m.number("<B"),  # the protocol, which the instructions tell better
         "\x95": lambda m: m.number("<Q"),  # a frame says how much to read ahead
-        "(": _Machine.mark, "0": _Machine.pop, "1": _discard_mark,
+        "(": Machine.mark, "0": Machine.pop, "1": _discard_mark,
         "2": lambda m: m.push(m._stack[-1]),
         "N": _constant(None), "\x88": _constant(True), "\x89": _constant(False),  # noqa: FBT003
-        "I": _Machine.line_integer, "L": lambda m: m.push(m.line_number()), "F": _Machine.line_float,
+        "I": Machine.line_integer, "L": lambda m: m.push(m.line_number()), "F": Machine.line_float,
         "K": _number("<B"), "M": _number("<H"), "J": _number("<i"), "G": _number(">d"),
         "\x8a": _long("<B"), "\x8b": _long("<i"),
-        "S": _Machine.line_string, "V": _Machine.line_unicode, "U": _text("<B"), "T": _text("<i"),
+        "S": Machine.line_string, "V": Machine.line_unicode, "U": _text("<B"), "T": _text("<i"),
         "\x8c": _unicode("<B"), "X": _unicode("<I"), "\x8d": _unicode("<Q"),
         "C": _bytes("<B"), "B": _bytes("<I"), "\x8e": _bytes("<Q"), "\x96": _bytes("<Q"),
         ")": lambda m: m.push(()), "t": lambda m: m.push(tuple(m.pop_mark())),
@@ -331,10 +337,10 @@ _STEPS: dict[int, Callable[[_Machine], object]] = {
         "\x90": lambda m: m.append(m.pop_mark()),
         "}": lambda m: m.push({}), "d": _dictionary, "s": _set_item, "u": lambda m: m.update(m.pop_mark()),
         "p": lambda m: m.put(m.line_number()), "q": lambda m: m.put(m.number("<B")),
-        "r": lambda m: m.put(m.number("<I")), "\x94": _Machine.memoize,
+        "r": lambda m: m.put(m.number("<I")), "\x94": Machine.memoize,
         "g": lambda m: m.get(m.line_number()), "h": lambda m: m.get(m.number("<B")),
         "j": lambda m: m.get(m.number("<I")),
-        "c": _Machine.line_name, "\x93": _Machine.stack_name,
-        "R": _Machine.call, "\x81": _Machine.call, "b": _Machine.build,
+        "c": Machine.line_name, "\x93": Machine.stack_name,
+        "R": Machine.call, "\x81": Machine.call, "b": lambda m: m.build(), "Q": Machine.stored,
     }.items()
 }  # fmt: skip
