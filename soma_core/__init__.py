@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from soma_core.inversion.identity import IdentityFit, fit_identity
     from soma_core.inversion.priors import HINGES, PosePriors
     from soma_core.inversion.result import InversionResult
-    from soma_core.io.amass import SmplMotion, read_amass, write_amass
+    from soma_core.io.amass import SmplMotion, write_amass
     from soma_core.io.clip import SkinnedClip, skinned_clip
     from soma_core.io.gltf import write_gltf
     from soma_core.io.joint_order import USER_JOINTS
@@ -117,7 +117,8 @@ _HOMES = {
     "soma_core.io.motion": ["Motion"],
     "soma_core.io.joint_order": ["USER_JOINTS"],
     "soma_core.io.motion_files": ["read_motion", "write_motion"],
-    "soma_core.io.amass": ["SmplMotion", "read_amass", "write_amass"],
+    "soma_core.io.amass": ["SmplMotion", "write_amass"],
+    "soma_core.io.smpl_files": ["SmplChoices", "read_amass", "read_smpl"],
     "soma_core.io.sam3d": ["Sam3dFrames", "read_sam3d"],
     # Moving meshes, and scenes that other programs open
     "soma_core.io.vertex_sequence": ["VertexSequence"],

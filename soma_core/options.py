@@ -18,11 +18,14 @@ __all__ = [
     "AnalyticalChoice",
     "AutogradChoice",
     "BackendChoice",
+    "BetasFrom",
     "BodyGender",
     "ConvertResult",
+    "Coordinates",
     "FitLod",
     "FrameRange",
     "Gallery",
+    "Gaps",
     "IdentityChoice",
     "IdentityMethod",
     "IdentitySource",
@@ -35,10 +38,20 @@ __all__ = [
     "Picture",
     "PriorChoice",
     "Product",
+    "RotationLayout",
+    "SmplModel",
     "Topology",
     "Translation",
     "Upward",
 ]
+
+
+class BetasFrom(StrEnum):
+    """How one body is made of shapes for each frame."""
+
+    mean = "mean"
+    median = "median"
+    first = "first"
 
 
 class BodyGender(StrEnum):
@@ -56,6 +69,13 @@ class ConvertResult(StrEnum):
     vertices = "vertices"
 
 
+class Coordinates(StrEnum):
+    """Which of a file's motions of one person is taken."""
+
+    world = "world"
+    camera = "camera"
+
+
 class FitLod(StrEnum):
     """Level of detail that poses are fitted on."""
 
@@ -68,6 +88,13 @@ class Gallery(StrEnum):
 
     one = "one"
     all = "all"
+
+
+class Gaps(StrEnum):
+    """What becomes of frames that a file lacks."""
+
+    interpolate = "interpolate"
+    drop = "drop"
 
 
 class IdentityMethod(StrEnum):
@@ -116,6 +143,23 @@ class Product(StrEnum):
     usd = "usd"
     glb = "glb"
     png = "png"
+
+
+class RotationLayout(StrEnum):
+    """Order of quaternions; whether 6D rotations are the first two rows or columns of a matrix."""
+
+    wxyz = "wxyz"
+    xyzw = "xyzw"
+    rows = "rows"
+    columns = "columns"
+
+
+class SmplModel(StrEnum):
+    """Models of the SMPL family."""
+
+    smpl = "smpl"
+    smplh = "smplh"
+    smplx = "smplx"
 
 
 class Topology(StrEnum):

@@ -67,10 +67,10 @@ PUBLIC_NAMES = {
     "soma_core": """
         AnalyticalOptions AssetError AutogradOptions BackendError CanonicalMesh HINGES Identity IdentityFit
         InputError InversionResult Motion NativeFit NativeMotion NativeTransfer PoseInversion PosePriors
-        Posed Rig Sam3dFrames ShapeSpace SkinnedClip SmplMotion SomaError SomaLayer USER_JOINTS
+        Posed Rig Sam3dFrames ShapeSpace SkinnedClip SmplChoices SmplMotion SomaError SomaLayer USER_JOINTS
         VertexSequence __version__ assets_dir default_registry diagnose_fit fit_identity load_canonical
         load_shape_space
-        open_vertex_sequence read_amass read_motion read_sam3d skinned_clip write_amass write_gltf
+        open_vertex_sequence read_amass read_motion read_sam3d read_smpl skinned_clip write_amass write_gltf
         write_motion write_usd
     """,
     "soma_core.motion": """

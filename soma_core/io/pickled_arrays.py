@@ -126,7 +126,44 @@ class RecordArrays:
         if self._left < 0:
             raise ValueError("arrays that unfold to far more than the file holds")
 
-    def _shape(value: Any) -> tuple[int, ...]:
+    def _numpy_array(self, shape: Any, dtype: Any, fortran: Any, data: Any) -> np.ndarray:
+        self._spend(len(data.arguments[0]) if type(data) is Record else len(data))
+        kind, content = _dtype(dtype), _buffer(data)
+        sizes = _shape(shape)
+        if math.prod(sizes) * kind.itemsize != len(content):
+            raise ValueError(f"{len(content)} bytes for the shape {sizes} of {kind}")
+        array = np.frombuffer(content, kind).reshape(sizes, order="F" if fortran else "C")
+        return array.astype(kind.newbyteorder("="))
+
+    def _selected(self, state: Mapping[Any, Any], depth: int) -> np.ndarray:
+        values, index = self._array(state["a"], depth).ravel(), self._array(state["idxs"], depth)
+        if index.dtype.kind not in "iu" or (index.size and not 0 <= index.min() <= index.max() < len(values)):
+            raise ValueError(f"a selection that leaves its {len(values)} values")
+        shape = state.get("preferred_shape")
+        self._spend(index.size * values.itemsize)
+        selected = values[index]
+        return selected if shape is None else selected.reshape(_shape(shape))
+
+    def _dense(self, kind: str, state: Mapping[Any, Any], depth: int) -> np.ndarray:
+        shape = _shape(state.get("_shape", state.get("shape")))
+        names = ("row", "col") if kind == "coo" else ("indptr", "indices")
+        data, first, second = (self._array(state[name], depth) for name in ("data", *names))
+        return self.dense(StoredMatrix(layout=kind, indices=(first, second), values=data, shape=shape))
+
+
+def _class(value: Record) -> Global:
+    """What the record is an instance of, or the function that makes it."""
+    return value.arguments[0] if value.function.name == "_reconstructor" else value.function
+
+
+def _state(value: Record) -> Mapping[Any, Any]:
+    state = value.state[0] if type(value.state) is tuple else value.state
+    if type(state) is not dict:
+        raise ValueError(f"a {_class(value)} without its values")
+    return state
+
+
+def _shape(value: Any) -> tuple[int, ...]:
     fits = type(value) is tuple and len(value) <= _MOST_AXES
     if not fits or not all(type(size) is int and 0 <= size <= _LONGEST_AXIS for size in value):
         raise ValueError("a shape that is none")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import logging
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -76,6 +76,12 @@ class Converter:
     def __init__(self, options: ConvertOptions) -> None:
         self._options, self._backends = options, FitBackends(options)
 
+    def of_person(self, person: str) -> Converter:
+        """The same for one person of a file of several, with the same backends and fits."""
+        other = Converter(replace(self._options, person=person))
+        other._backends = self._backends
+        return other
+
     def __call__(self, path: Path, files: ResultFiles, chunks: Path) -> Converted:
         """Convert a file.
 
@@ -127,7 +133,7 @@ def _known_layout(path: Path) -> Layout:
         raise InputError(
             str(path),
             got="no motion under any key that is known",
-            expected="the keys of an AMASS, SAM 3D Body, kimodo or SOMA file",
+            expected="the keys of a file of the SMPL family, SAM 3D Body, kimodo or SOMA",
             fix="Vertices over time are what soma invert takes.",
         )
     return layout

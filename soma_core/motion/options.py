@@ -7,15 +7,20 @@ from dataclasses import dataclass, field
 from soma_core.errors import InputError
 from soma_core.options import (
     BackendChoice,
+    BetasFrom,
     BodyGender,
     ConvertResult,
+    Coordinates,
     FitLod,
+    Gaps,
     IdentityChoice,
     InversionChoice,
     LengthUnit,
     ModelOptions,
     Options,
     Picture,
+    RotationLayout,
+    SmplModel,
     Topology,
     Translation,
     Upward,
@@ -88,7 +93,16 @@ class ConvertOptions(FitOptions):
         result: of the way back; None: poses of SMPL models, vertices of others.
         gender: of SMPL models; None: that of the file.
         most_betas: how many of a file's shape coefficients are used; None: all.
-        betas: shape coefficients of the model, on the way back; None: the body's own, or the nearest.
+        betas: shape coefficients of SMPL models; None: those of the file, on the way back the body's own, or
+            the nearest.
+        betas_from: what is made of a file's shapes for each frame.
+        model: of the SMPL family, that a file's poses are of; None: as the file tells.
+        person: whose motion, in a file of several people; ``all`` for a motion of each.
+        coordinates: the motion in the world or in the camera; None: the world where the file has it.
+        rotation_layout: of quaternions and 6D rotations; None: as the numbers tell.
+        flat_hand_mean: whether zero is a flat hand; None: as the file says, or flat.
+        gaps: what becomes of frames that a file lacks or where it holds NaN.
+        longest_gap: that is interpolated [s].
         translation: where the body stands, on the way back.
     """
 
@@ -97,6 +111,14 @@ class ConvertOptions(FitOptions):
     gender: BodyGender | None = None
     most_betas: int | None = None
     betas: list[float] | None = None
+    betas_from: BetasFrom = BetasFrom.mean
+    model: SmplModel | None = None
+    person: str | None = None
+    coordinates: Coordinates | None = None
+    rotation_layout: RotationLayout | None = None
+    flat_hand_mean: bool | None = None
+    gaps: Gaps = Gaps.interpolate
+    longest_gap: float = 1.0
     translation: Translation = Translation.motion
 
     def __post_init__(self) -> None:
@@ -107,7 +129,7 @@ class ConvertOptions(FitOptions):
         why = f"to={self.to}"
         if self.to == "soma":
             placed = None if self.translation == "motion" else str(self.translation)
-            unused = {"betas": self.betas, "result": self.result, "translation": placed}
+            unused = {"result": self.result, "translation": placed}
             if self.backend is not None and sought is None and self.backend.name != "mhr":
                 unused["backend"] = self.backend.name  # a file tells its own model
             why = "to=soma" if sought else "to=soma and identity=known"

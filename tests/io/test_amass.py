@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from soma_core.errors import AssetError, InputError
-from soma_core.io.amass import SMPL_JOINTS, SmplMotion, read_amass, write_amass
+from soma_core.io.amass import SMPL_JOINTS, SmplMotion, write_amass
+from soma_core.io.smpl_files import read_amass
 
 FRAMES = 4
 
