@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from soma_core.io.motion import Motion
     from soma_core.io.motion_files import read_motion, write_motion
     from soma_core.io.sam3d import Sam3dFrames, read_sam3d
+    from soma_core.io.smpl_files import SmplChoices, read_amass, read_smpl
     from soma_core.io.usd import write_usd
     from soma_core.io.vertex_files import open_vertex_sequence
     from soma_core.io.vertex_sequence import VertexSequence
@@ -68,6 +69,7 @@ __all__ = [
     "Sam3dFrames",
     "ShapeSpace",
     "SkinnedClip",
+    "SmplChoices",
     "SmplMotion",
     "SomaError",
     "SomaLayer",
@@ -83,6 +85,7 @@ __all__ = [
     "read_amass",
     "read_motion",
     "read_sam3d",
+    "read_smpl",
     "skinned_clip",
     "write_amass",
     "write_gltf",

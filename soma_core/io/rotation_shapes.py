@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from typing import Literal
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-__all__ = ["RotationLayout", "axis_angles", "split_shape"]
+__all__ = ["WIDTHS", "RotationLayout", "axis_angles", "split_shape"]
 
 RotationLayout = Literal["wxyz", "xyzw", "rows", "columns"]
 """Order of quaternions, and whether six numbers are the first two rows or columns of a matrix."""
 
-_WIDTHS = (3, 4, 6, 9)
+WIDTHS = (3, 4, 6, 9)
+"""Numbers of one rotation: a vector, a quaternion, two rows or columns, a matrix."""
+
 _ROTATION_TOLERANCE = 0.02
 """Largest entry of |RᵀR - I| accepted of matrices, and departure of a norm from 1: estimators store half
 precision and means of rotations; a scaled matrix does not pass."""
@@ -29,14 +32,11 @@ def split_shape(shape: tuple[int, ...], joints: Sequence[int]) -> tuple[tuple[in
         shape: of the array; joints and numbers may share an axis.
         joints: numbers of joints that are possible.
     """
-    for count in joints:
-        for width in _WIDTHS:
-            tails: list[tuple[int, ...]] = [(count * width,), (count, width)]
-            tails += [(count, 3, 3)] if width == 9 else []
-            for tail in tails:
-                lead = shape[: -len(tail)]
-                if shape[-len(tail) :] == tail and len(lead) <= 2 and 0 not in shape:
-                    return lead, count, width
+    for count, width in itertools.product(joints, WIDTHS):
+        for tail in ((count * width,), (count, width), *([(count, 3, 3)] if width == 9 else [])):
+            lead = shape[: -len(tail)]
+            if shape[-len(tail) :] == tail and len(lead) <= 2 and 0 not in shape:
+                return lead, count, width
     return None
 
 

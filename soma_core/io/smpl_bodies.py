@@ -15,7 +15,7 @@ from soma_core.io.smpl_names import PARTS, Space, Tool, part_of, space_of, tool_
 
 __all__ = [
     "BODY_JOINTS", "POSE_JOINTS", "FoundBody", "choose_body", "find_bodies", "holds_poses", "people_in",
-    "shown_names", "wanted_names",
+    "shown_names", "strange_poses", "wanted_names",
 ]  # fmt: skip
 
 POSE_JOINTS = (24, 52, 55, 22)
@@ -23,6 +23,9 @@ POSE_JOINTS = (24, 52, 55, 22)
 
 BODY_JOINTS = (21, 23)
 """Those without the root: SMPL has a joint for each hand."""
+
+_JOINTS = {"pose": (*POSE_JOINTS, *BODY_JOINTS), "body": BODY_JOINTS}
+"""Joints that parts may have by which a body is told."""
 
 _MOTION_X = {
     "root": 3, "body": 63, "hands": 90, "jaw": 3, "expression": 50, "face_shape": 100, "trans": 3, "betas": 10,
@@ -155,14 +158,10 @@ class _Walk:
 
     def _is_frame(self, node: Mapping[Any, Any]) -> bool:
         """Whether a body of a list is one frame, and the list their sequence."""
-        named = self._named(node, ())
-        for part, joints in (("pose", (*POSE_JOINTS, 23)), ("body", BODY_JOINTS)):
-            for name, space in named:
-                shape = self._file.shape(named[name, space][1]) if name == part else None
-                split = split_shape(shape, joints) if shape is not None else None
-                if split is not None:
-                    return split[0] in ((), (1,))
-        return False
+        poses = [(part, value) for (part, _), (_, value) in self._named(node, ()).items() if part in _JOINTS]
+        shapes = [(self._file.shape(value), _JOINTS[part]) for part, value in poses]
+        splits = [split_shape(shape, joints) for shape, joints in shapes if shape is not None]
+        return any(split is not None and split[0] in ((), (1,)) for split in splits)
 
     def _of_names(self, node: Mapping[Any, Any], way: tuple[str, ...], above: Mapping[str, Any]) -> Iterator[Any]:
         tracks = _tracks(node)
@@ -174,7 +173,7 @@ class _Walk:
         named = self._named(node, way)
         shared = dict(above) | {part: named[part, None] for part in _SHARED if (part, None) in named}
         names = {*way, *map(str, node)}
-        for space in dict.fromkeys(space for part, space in named if part in ("pose", "body")):
+        for space in dict.fromkeys(space for part, space in named if part in _JOINTS):
             parts = shared | {part: value for (part, other), value in named.items() if other in (space, None)}
             parts |= {part: value for (part, other), value in named.items() if other == space}
             for body in self._people(parts, way, space, names):
@@ -191,18 +190,14 @@ class _Walk:
             if found is None or value is None:
                 continue
             part, space, rank = found
-            if (part, space) not in ranked or rank < ranked[part, space][0]:
-                if part in ("pose", "body") and not self._has_shape(part, value):
-                    continue
+            known = ranked.get((part, space))
+            if (known is None or rank < known[0]) and (part not in _JOINTS or self._layout(part, value)):
                 ranked[part, space] = rank, "/".join((*way, str(key))), value
         return {part: (name, value) for part, (_, name, value) in ranked.items()}
 
-    def _has_shape(self, part: str, value: Any) -> bool:
-        return self._layout(part, value) is not None
-
     def _layout(self, part: str, value: Any) -> tuple[int | None, bool] | None:
         """People along the first axis (None: one), and whether time is last; None where these are no rotations."""
-        joints = (*POSE_JOINTS, 23, 21) if part == "pose" else BODY_JOINTS
+        joints = _JOINTS[part]
         if isinstance(value, (list, tuple)) and value:
             first = self._file.shape(value[0])
             split = split_shape(first, joints) if first is not None else None
@@ -258,22 +253,43 @@ def _tracks(node: Mapping[Any, Any]) -> dict[str, dict[str, tuple[str, Any]]]:
         return {}
     seen: dict[str, dict[str, list[Any]]] = {}
     for number, frame in enumerate(frames):
-        people, unseen = frame.get("tid", frame.get("tracked_ids")), frame.get("tracked_time", ())
-        if not isinstance(people, (list, tuple)) or len(people) != len(frame["smpl"]):
-            people = range(len(frame["smpl"]))
         time = frame.get("time") if type(frame.get("time")) is int else number
-        for place, (person, body) in enumerate(zip(people, frame["smpl"], strict=True)):
-            predicted = place < len(unseen) and unseen[place] not in (0, None)
-            if isinstance(body, dict) and not predicted and {"global_orient", "body_pose"} <= body.keys():
-                track = seen.setdefault(str(person), {"root": [], "body": [], "betas": [], "frames": []})
-                values = (body["global_orient"], body["body_pose"], body.get("betas"), time)
-                for part, value in zip(track, values, strict=True):
-                    track[part].append(value)
+        for person, body in _seen_in(frame):
+            track = seen.setdefault(person, {"root": [], "body": [], "betas": [], "frames": []})
+            values = (body["global_orient"], body["body_pose"], body.get("betas"), time)
+            for part, value in zip(track, values, strict=True):
+                track[part].append(value)
     names = {"root": "smpl/global_orient", "body": "smpl/body_pose", "betas": "smpl/betas", "frames": "time"}
     return {
         person: {part: (names[part], values) for part, values in parts.items() if all(value is not None for value in values)}
         for person, parts in seen.items()
     }
+
+
+def _seen_in(frame: Mapping[Any, Any]) -> Iterator[tuple[str, Mapping[Any, Any]]]:
+    """Whose bodies were seen in a frame, and not predicted for it."""
+    bodies, people, unseen = frame["smpl"], frame.get("tid", frame.get("tracked_ids")), frame.get("tracked_time")
+    if not isinstance(people, (list, tuple)) or len(people) != len(bodies):
+        people = range(len(bodies))
+    if not isinstance(unseen, (list, tuple)) or len(unseen) != len(bodies):
+        unseen = [0] * len(bodies)
+    for person, body, age in zip(people, bodies, unseen, strict=True):
+        if isinstance(body, dict) and age == 0 and {"global_orient", "body_pose"} <= body.keys():
+            yield str(person), body
+
+
+def strange_poses(file: DataFile) -> Iterator[tuple[str, str]]:
+    """Names of what should be poses and is not, with what they hold; at the top of a file and one level down."""
+    top = file.content if isinstance(file.content, dict) else {}
+    nested = {f"{key}/{name}": value for key, node in top.items() if isinstance(node, dict) for name, value in node.items()}
+    for name, value in (*top.items(), *nested.items()):
+        part = part_of(str(name).rpartition("/")[2])
+        if part is None or part[0] not in ("pose", "body"):
+            continue
+        try:
+            yield str(name), f"shape {file.array(value).shape}"
+        except ValueError as error:
+            yield str(name), f"an unreadable array ({error})"
 
 
 def wanted_names() -> str:

@@ -17,7 +17,8 @@ from soma_core.io.data_files import DataFile, open_data
 from soma_core.io.frame_gaps import fill_gaps, kept_frames
 from soma_core.io.rotation_shapes import RotationLayout
 from soma_core.io.smpl_bodies import (
-    FoundBody, choose_body, find_bodies, holds_poses, people_in, shown_names, wanted_names,
+    FoundBody, choose_body, find_bodies, holds_poses, people_in, shown_names, strange_poses,
+    wanted_names,
 )
 from soma_core.io.smpl_parts import BodyParts
 from soma_core.io.smpl_pose import SmplPose, read_pose
@@ -63,17 +64,23 @@ class SmplChoices:
     longest_gap: float = 1.0
 
 
-def smpl_layout(path: str | Path) -> str | None:
-    """``amass`` or ``smpl`` for a file with poses of the SMPL family, readable or not; None for others.
+def smpl_layout(path: str | Path, *, readable: bool = False) -> Literal["amass", "smpl"] | None:
+    """``amass`` or ``smpl`` for a file with poses of the SMPL family; None for others.
+
+    Args:
+        path: the file.
+        readable: whether names alone do not count, only poses that can be read.
 
     Raises:
         AssetError: the file is missing, damaged, a git-LFS pointer or not what its suffix says.
     """
     with open_data(path) as file:
+        if not find_bodies(file) and (readable or not holds_poses(file)):
+            return None
         names = set(file.content) if isinstance(file.content, dict) else set()
         if "trans" in names and names & {"poses", "pose_body"} and file.path.suffix.lower() == ".npz":
             return "amass"
-        return "smpl" if find_bodies(file) or holds_poses(file) else None
+        return "smpl"
 
 
 def people_of(path: str | Path) -> list[str]:
@@ -128,14 +135,21 @@ def read_smpl(path: str | Path, choices: SmplChoices | None = None) -> SmplMotio
     with open_data(path) as file:
         bodies = find_bodies(file)
         if not bodies:
-            raise InputError(
-                f"{file.path}: pose", got=f"only the keys {shown_names(file)}",
-                expected=f"poses of the SMPL family ({wanted_names()})",
-                fix="Rename the keys, or convert another file.",
-            )  # fmt: skip
+            raise _without_bodies(file)
         body = choose_body(file, bodies, person=choices.person, space=choices.coordinates)
         _say_choice(file, bodies, body)
         return _Reading(file, body, choices).motion()
+
+
+def _without_bodies(file: DataFile) -> InputError:
+    """What a file holds that has no pose to read: a pose of a shape that is none's, or other names."""
+    name, reason = next(strange_poses(file), ("pose", f"only the keys {shown_names(file)}"))
+    return InputError(
+        f"{file.path}: {name}", got=reason,
+        expected="72 values (smpl), 156 (smplh) or 165 (smplx) a frame, or as many joints as matrices, quaternions "
+        f"or 6D; keys: {wanted_names()}",
+        fix="Rename the keys, or convert another file.",
+    )  # fmt: skip
 
 
 def _say_choice(file: DataFile, bodies: Sequence[FoundBody], body: FoundBody) -> None:
@@ -165,7 +179,8 @@ class _Reading:
         translation = self._translation(pose.frames)
         numbers = self._parts.frame_numbers(pose.frames)
         whole = np.isfinite(pose.rotations).all(axis=(1, 2)) & np.isfinite(translation).all(axis=1)
-        rows, times = kept_frames(whole, numbers, self._parts.where(pose.leading))
+        unseen = "trans" if np.isfinite(pose.rotations).all() and "trans" in self._parts else pose.leading
+        rows, times = kept_frames(whole, numbers, self._parts.where(unseen))
         rotations, translation = self._without_gaps(pose.rotations[rows], translation[rows], times, fps, len(whole))
         flat = choices.flat_hand_mean
         return SmplMotion(

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from soma_core.io.amass import SmplName
-from soma_core.io.rotation_shapes import RotationLayout, axis_angles, split_shape
+from soma_core.io.rotation_shapes import WIDTHS, RotationLayout, axis_angles, split_shape
 from soma_core.io.smpl_bodies import BODY_JOINTS, POSE_JOINTS
 from soma_core.io.smpl_parts import BodyParts
 
@@ -123,12 +123,15 @@ class _Reader:
         values = self._parts.numbers(part)
         if self._parts.body.time_last and values.shape[-1:] == (self._frames,):
             values = np.moveaxis(values, -1, 0)
-        for rows in dict.fromkeys((self._frames, 1)):
-            width = values.size // (rows * count) if rows * count else 0
-            if width in (3, 4, 6, 9) and values.size == rows * count * width and len(values.reshape(rows, -1)) == rows:
-                turned = self._turned(part, values.reshape(rows, count, width))
-                return np.broadcast_to(turned, (self._frames, count, 3))
-        raise self._refuse_shape(part, values.shape, count)
+        rows = self._frames
+        single = values.ndim == 1 or values.shape[0] == 1
+        if values.size not in {rows * count * width for width in WIDTHS} and single:
+            rows = 1
+        width = values.size // (rows * count)
+        if width not in WIDTHS or values.size != rows * count * width:
+            raise self._refuse_shape(part, values.shape, count)
+        turned = self._turned(part, values.reshape(rows, count, width))
+        return np.broadcast_to(turned, (self._frames, count, 3))
 
     def _turned(self, part: str, values: np.ndarray) -> np.ndarray:
         width = values.shape[2]

@@ -83,7 +83,7 @@ def layout_of(path: str | Path) -> Layout | None:
         if "schema_version" in fields:
             return "soma"
         soma = {"poses", "transl"} <= {*fields.names}
-    return smpl_layout(path) or ("soma" if soma else None)
+    return smpl_layout(path, readable=soma) or ("soma" if soma else None)
 
 
 def read(path: str | Path, *, fps: float | None = None, unit: LengthUnit | str | None = None) -> Motion:
