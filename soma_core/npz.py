@@ -3,12 +3,9 @@
 from __future__ import annotations
 
 import io
-import lzma
 import math
-import struct
 import tokenize
 import zipfile
-import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -17,16 +14,11 @@ from typing import IO
 
 import numpy as np
 
-from soma_core.errors import AssetError
-from soma_core.files import refuse_unreadable
+from soma_core.zip_archive import ARCHIVE_DAMAGE, open_archive
 
 __all__ = ["ArrayHeader", "NpzFile", "open_npz_file", "read_array_header"]
 
-_DAMAGE = (
-    ValueError, TypeError, KeyError, IndexError, EOFError, OSError, RuntimeError, MemoryError, OverflowError,
-    SyntaxError, struct.error, zlib.error, lzma.LZMAError, zipfile.BadZipFile,
-)  # fmt: skip
-"""What zipfile and numpy raise for files that are not what they say. RuntimeError: encrypted members."""
+_DAMAGE = (*ARCHIVE_DAMAGE, SyntaxError)
 
 _LONGEST_HEADER = 10_000  # as numpy itself
 _BLOCK = 2**20
@@ -158,12 +150,5 @@ def open_npz_file(path: Path | str, *, fix: str = "Fetch or write it again.") ->
     Raises:
         AssetError: missing, a git-LFS pointer, or no NPZ.
     """
-    head = refuse_unreadable(path, fix=fix)
-    if not zipfile.is_zipfile(path):
-        raise AssetError(path, cause=f"not an NPZ file (it starts with {head[:8]!r})", fix=fix)
-    try:
-        archive = zipfile.ZipFile(path)
-    except _DAMAGE as error:
-        raise AssetError(path, cause=f"damaged NPZ file ({error})", fix=fix) from error
-    with archive:
+    with open_archive(path, kind="an NPZ file", fix=fix) as archive:
         yield NpzFile(Path(path), archive)

@@ -16,7 +16,7 @@ import warnings
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
-__all__ = ["STORED", "Global", "Machine", "PickleRules", "Record", "RefusedPickleError"]
+__all__ = ["STORED", "Global", "Machine", "PickleRules", "Record", "RefusedPickleError", "run_pickle"]
 
 _LONG_TEXT = 1024
 """Bytes from which on a string is left in the file until it is asked for."""
@@ -71,6 +71,23 @@ class PickleRules(NamedTuple):
 STORED = Global("", "stored outside of the pickle")
 
 
+def run_pickle(data: mmap.mmap | bytes, rules: PickleRules) -> Any:
+    """Contents of a pickle of protocols 0 to 5 as None, bool, int, float, text, bytes, tuple, list, dict.
+
+    Strings of Python 2 are read as Latin-1; long ones come as a memoryview of the file. Sets come as
+    lists; everything else as a :class:`Record`.
+
+    Raises:
+        RefusedPickleError: damaged, or with names, keys or instructions beyond the rules.
+    """
+    try:
+        return Machine(data, rules).run()
+    except RefusedPickleError:
+        raise
+    except (IndexError, KeyError, TypeError, ValueError, struct.error, OverflowError, MemoryError) as error:
+        raise RefusedPickleError(f"is no sound pickle ({type(error).__name__})") from error
+
+
 class _Ordered(dict[Any, Any]):
     """A dictionary that the pickle makes by its class, and changes by what it calls its state."""
 
@@ -80,7 +97,7 @@ _SETS = (Global("builtins", "set"), Global("__builtin__", "set"))
 
 
 class Machine:
-    """A pickle under way; `run` gives its contents, or the exceptions of Python for a damaged one."""
+    """A pickle under way."""
 
     def __init__(self, file: mmap.mmap | bytes, rules: PickleRules) -> None:
         self._file, self._data, self._at = file, memoryview(file), 0
@@ -90,6 +107,7 @@ class Machine:
         self._memo: dict[int, Any] = {}
 
     def run(self) -> Any:
+        """Follow the program to its end and give what it leaves."""
         for _ in range(self._rules.most_instructions):
             code = self._take(1)[0]
             if code == ord("."):
@@ -125,6 +143,7 @@ class Machine:
         return line
 
     def number(self, layout: str) -> int:
+        """Take a number of this layout."""
         return struct.unpack(layout, self._take(struct.calcsize(layout)))[0]
 
     def text(self, count: int) -> str | memoryview:
@@ -135,33 +154,40 @@ class Machine:
     # The stack
 
     def push(self, value: Any) -> None:
+        """Put a value onto the stack."""
         self._stack.append(value)
 
     def pop(self) -> Any:
+        """Take the uppermost value, which must not lie under a mark."""
         if self._marks and len(self._stack) <= self._marks[-1]:
             raise RefusedPickleError("is no sound pickle: it takes a value that is not there")
         return self._stack.pop()
 
     def mark(self) -> None:
+        """Remember how high the stack is."""
         self._marks.append(len(self._stack))
 
     def pop_mark(self) -> list[Any]:
+        """Take all that lies above the last mark."""
         start = self._marks.pop()
         items = self._stack[start:]
         del self._stack[start:]
         return items
 
     def pop_tuple(self, count: int) -> None:
+        """Put the uppermost values into a tuple."""
         items = tuple(self.pop() for _ in range(count))[::-1]
         self.push(items)
 
     def append(self, items: list[Any]) -> None:
+        """Append to the uppermost list."""
         target = self._stack[-1]
         if type(target) is not list:
             raise RefusedPickleError(f"is no plain data: it appends to {_kind(target)}")
         target.extend(items)
 
     def update(self, items: list[Any]) -> None:
+        """Set items of the uppermost dictionary: keys and values in turn."""
         target = self._stack[-1]
         if type(target) not in (dict, _Ordered) or len(items) % 2:
             raise RefusedPickleError(f"is no plain data: it sets items of {_kind(target)}")
@@ -182,6 +208,7 @@ class Machine:
     # What stands for classes and calls
 
     def name(self, module: Any, name: Any) -> None:
+        """Put a name that the rules allow onto the stack."""
         if type(module) is not str or type(name) is not str:
             raise RefusedPickleError(f"names a class by {_kind(module)} and {_kind(name)}")
         if (module, name) not in self._rules.names:
@@ -190,6 +217,7 @@ class Machine:
         self.push(Global(module, name))
 
     def call(self) -> None:
+        """Make a record of a call."""
         arguments, function = self.pop(), self.pop()
         if type(function) is not Global or type(arguments) is not tuple:
             raise RefusedPickleError(f"is no plain data: it calls {_kind(function)}")
@@ -200,11 +228,13 @@ class Machine:
         self.push(_Ordered() if empty else Record(function, arguments))
 
     def stored(self) -> None:
+        """Make a record of a reference to what lies outside."""
         if not self._rules.stored:
             raise RefusedPickleError("is no pickle of plain data: it refers to something outside of it")
         self.push(Record(STORED, (self.pop(),)))
 
     def build(self) -> None:
+        """Give a record its state."""
         state, target = self.pop(), self._stack[-1]
         if type(target) is _Ordered:
             return
@@ -215,29 +245,36 @@ class Machine:
     # Memory of what was made before
 
     def put(self, index: int) -> None:
+        """Remember the uppermost value under a number."""
         if not 0 <= index < self._rules.most_instructions:  # integers that collide would take for ever
             raise RefusedPickleError(f"is no sound pickle: it remembers {index} values")
         self._memo[index] = self._stack[-1]
 
     def memoize(self) -> None:
+        """Remember the uppermost value under the next number."""
         self._memo[len(self._memo)] = self._stack[-1]
 
     def get(self, index: int) -> None:
+        """Put a remembered value onto the stack."""
         self.push(self._memo[index])
 
     # Numbers and strings written as lines
 
     def line_number(self) -> int:
+        """Take a whole number that is written as a line."""
         return _parsed(self._line(), int)
 
     def line_integer(self) -> None:
+        """Put a number or truth value that is written as a line onto the stack."""
         line = self._line()
         self.push({b"00": False, b"01": True}.get(line) if line in (b"00", b"01") else _parsed(line, int))
 
     def line_float(self) -> None:
+        """Put a number that is written as a line onto the stack."""
         self.push(_parsed(self._line(), float))
 
     def line_string(self) -> None:
+        """Put a string in quotes onto the stack."""
         line = self._line().strip()
         if len(line) < 2 or line[:1] not in (b"'", b'"') or line[-1:] != line[:1]:
             raise RefusedPickleError("is no sound pickle: a string is not in quotes")
@@ -247,13 +284,16 @@ class Machine:
         self.push(str(text, "latin-1") if len(text) < _LONG_TEXT else memoryview(text))
 
     def line_unicode(self) -> None:
+        """Put a text that is written as a line onto the stack."""
         self.push(str(self._line(), "raw-unicode-escape"))
 
     def line_name(self) -> None:
+        """Put a name that is written as two lines onto the stack."""
         module = str(self._line(), "utf-8", "replace")
         self.name(module, str(self._line(), "utf-8", "replace"))
 
     def stack_name(self) -> None:
+        """Put the name that two texts on the stack make onto it."""
         name, module = self.pop(), self.pop()
         self.name(module, name)
 
@@ -341,6 +381,6 @@ _STEPS: dict[int, Callable[[Machine], object]] = {
         "g": lambda m: m.get(m.line_number()), "h": lambda m: m.get(m.number("<B")),
         "j": lambda m: m.get(m.number("<I")),
         "c": Machine.line_name, "\x93": Machine.stack_name,
-        "R": Machine.call, "\x81": Machine.call, "b": lambda m: m.build(), "Q": Machine.stored,
+        "R": Machine.call, "\x81": Machine.call, "b": Machine.build, "Q": Machine.stored,
     }.items()
 }  # fmt: skip

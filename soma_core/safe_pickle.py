@@ -8,16 +8,15 @@ leaves.
 from __future__ import annotations
 
 import mmap
-import struct
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 from soma_core.errors import AssetError
 from soma_core.files import refuse_unreadable
-from soma_core.pickle_machine import Global, Machine, PickleRules, Record, RefusedPickleError
+from soma_core.pickle_machine import Global, PickleRules, Record, RefusedPickleError, run_pickle
 
-__all__ = ["ALLOWED_NAMES", "plain_values", "read_pickle", "run_pickle"]
+__all__ = ["ALLOWED_NAMES", "plain_values", "read_pickle"]
 
 MOST_BYTES = 600 * 2**20
 
@@ -51,10 +50,7 @@ _BODY_MODEL = PickleRules(ALLOWED_NAMES, "a body model")
 
 
 def read_pickle(path: Path | str, rules: PickleRules = _BODY_MODEL) -> Any:
-    """Contents of a pickle of protocols 0 to 5 as None, bool, int, float, text, bytes, tuple, list, dict.
-
-    Strings of Python 2 are read as Latin-1; long ones come as a memoryview of the file. Sets come as
-    lists; everything else as a :class:`Record`.
+    """Contents of a pickle, as :func:`~soma_core.pickle_machine.run_pickle` gives them.
 
     Raises:
         AssetError: missing, a git-LFS pointer, truncated, too large, or a pickle that names what is not
@@ -68,20 +64,6 @@ def read_pickle(path: Path | str, rules: PickleRules = _BODY_MODEL) -> Any:
     except RefusedPickleError as error:
         fix = "Nothing of it was run. Get the file from the model's official site."
         raise AssetError(path, cause=str(error), fix=fix) from error
-
-
-def run_pickle(data: mmap.mmap | bytes, rules: PickleRules) -> Any:
-    """Contents of a pickle, as :func:`read_pickle` gives them.
-
-    Raises:
-        RefusedPickleError: damaged, or with names, keys or instructions beyond the rules.
-    """
-    try:
-        return Machine(data, rules).run()
-    except RefusedPickleError:
-        raise
-    except (IndexError, KeyError, TypeError, ValueError, struct.error, OverflowError, MemoryError) as error:
-        raise RefusedPickleError(f"is no sound pickle ({type(error).__name__})") from error
 
 
 def plain_values(content: Any, made: Callable[[Record], Any]) -> Any:

@@ -18,8 +18,8 @@ import numpy as np
 
 from soma_core.errors import AssetError
 from soma_core.files import refuse_unreadable
-from soma_core.pickle_machine import STORED, Global, PickleRules, Record
-from soma_core.safe_pickle import ALLOWED_NAMES, plain_values, run_pickle
+from soma_core.pickle_machine import STORED, Global, PickleRules, Record, run_pickle
+from soma_core.safe_pickle import ALLOWED_NAMES, plain_values
 from soma_core.stored_matrix import StoredMatrix
 from soma_core.zip_archive import ARCHIVE_DAMAGE, open_archive
 
@@ -116,14 +116,14 @@ class _Contents:
         if len(pickles) != 1:
             raise ValueError("is not what torch.save writes: no data.pkl, or several")
         self._root = pickles[0].removesuffix("data.pkl")
-        if f"{self._root}constants.pkl" in self._members:
-            raise ValueError("is a TorchScript program, which is code, where tensors were expected")
         order = f"{self._root}byteorder"
         self._order = ">" if order in self._members and self._member(order, most=6) == b"big" else "<"
 
     def _refuse_strange_members(self, size: int) -> None:
         if len(self._members) != len(self._archive.infolist()):
             raise ValueError("has two members of one name")
+        if any(name.endswith("/constants.pkl") for name in self._members):
+            raise ValueError("is a TorchScript program, which is code, where tensors were expected")
         if any(info.compress_type != zipfile.ZIP_STORED for info in self._members.values()):
             raise ValueError("has compressed members, which torch.save never writes")
         if sum(info.file_size for info in self._members.values()) > size:

@@ -43,7 +43,7 @@ def open_archive(
         _refuse_long_directory(Path(path))
         archive = zipfile.ZipFile(path)
     except ARCHIVE_DAMAGE as error:
-        raise AssetError(path, cause=f"damaged; it is not {kind} ({error})", fix=fix) from error
+        raise AssetError(path, cause=f"damaged {kind.partition(' ')[2]} ({error})", fix=fix) from error
     with archive:
         yield archive
 

@@ -35,7 +35,23 @@ TREE_MIB = 28
 
 # A package imports from lower ranks and its own, never from higher ones.
 RANKS = [
-    {"_lazy", "_version", "errors", "paths", "cache", "files", "npz", "obj", "options", "progress"},
+    {
+        "_lazy",
+        "_version",
+        "errors",
+        "paths",
+        "cache",
+        "files",
+        "npz",
+        "obj",
+        "options",
+        "pickle_machine",
+        "progress",
+        "safe_pickle",
+        "stored_matrix",
+        "tensor_archive",
+        "zip_archive",
+    },
     {"geometry", "plugin"},
     {"kernels", "_inputs", "_derived"},
     {"rig", "topology", "skeleton", "animation", "correctives"},

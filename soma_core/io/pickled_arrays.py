@@ -83,8 +83,9 @@ class RecordArrays:
         Raises:
             ValueError: indices that leave it, or too large.
         """
-        self._spend(math.prod(matrix.shape) * matrix.values.itemsize)
-        return matrix.dense()
+        made = matrix.dense()
+        self._spend(made.nbytes)
+        return made
 
     def _refusing(self, record: Any, words: str) -> np.ndarray:
         try:

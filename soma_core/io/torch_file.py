@@ -13,7 +13,7 @@ __all__ = ["read_torch_arrays"]
 
 
 def read_torch_arrays(path: Path | str) -> Any:
-    """Contents of a ``.pt`` or ``.pth`` file: nested dictionaries, lists and tuples of arrays and plain values.
+    """Contents of a ``.pt`` or ``.pth`` file: nested dictionaries, lists, tuples, arrays and plain values.
 
     Tensors come as arrays in native byte order (bfloat16 as float32, sparse ones dense), which may be
     read-only views of each other; numpy's arrays as they are; keys are text or integers. Nothing is run,

@@ -49,6 +49,11 @@ def test_arrays_of_protocol_5_come_back(tmp_path):
     np.testing.assert_array_equal(found["b"], NUMBERS[0], strict=True)
 
 
+def _sparse(*, shape=(2, 2), indptr=(0, 1, 2), indices=(0, 1)):
+    state = {"_shape": shape, "data": np.ones(2), "indices": np.array(indices), "indptr": np.array(indptr)}
+    return Instance("scipy.sparse.csc", "csc_matrix", state)
+
+
 @pytest.mark.parametrize(
     ("value", "cause"),
     [
@@ -60,10 +65,15 @@ def test_arrays_of_protocol_5_come_back(tmp_path):
         (Instance("chumpy.ch", "Ch", {"y": NUMBERS}), "KeyError.'x'"),
         (Instance("chumpy.reordering", "Select", {"a": NUMBERS, "idxs": np.array([600])}), "leaves its 600"),
         (Instance("chumpy.reordering", "Select", {"a": NUMBERS, "idxs": np.array([-1])}), "leaves its 600"),
-        (
-            Instance("scipy.sparse.csc", "csc_matrix", {"_shape": (1 << 20, 1 << 20)}),
-            "sparse matrix of 1048576",
-        ),
+        (Instance("scipy.sparse.csc", "csc_matrix", {"_shape": (2, 2)}), "KeyError.'data'"),
+        (_sparse(shape=(1 << 20, 1 << 20)), "sparse matrix of 1048576"),
+        (_sparse(indptr=[0, 9, 0]), "starts that do not divide 2 entries"),
+        (_sparse(indptr=[0, 9, 2]), "starts that do not divide 2 entries"),
+        (_sparse(indptr=[1, 1, 2]), "starts that do not divide 2 entries"),
+        (_sparse(indptr=[0, 2]), "starts that do not divide 2 entries into 2"),
+        (_sparse(indices=[0, 2]), "indices that leave the 2 rows"),
+        (_sparse(indices=[-1, 0]), "indices that leave the 2 rows"),
+        (_sparse(indices=[0.0, 1.0]), "no rows of integers"),
     ],
 )
 def test_a_key_without_numbers_is_named(tmp_path, value, cause):
