@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from soma_core.pickle_machine import STORED, Global, Machine, PickleRules, Record, RefusedPickleError
+from soma_core.pickle_machine import STORED, Global, Machine, PickleRules, Record, RefusedPickleError, run_machine
 from soma_core.safe_pickle import ALLOWED_NAMES
 
 __all__ = ["array_text", "is_tensor", "run_motion_pickle", "tensor_array"]
@@ -23,6 +23,7 @@ __all__ = ["array_text", "is_tensor", "run_motion_pickle", "tensor_array"]
 _WRAPPERS = frozenset(
     Global(f"{package}.numpy_pickle", "NumpyArrayWrapper") for package in ("joblib", "sklearn.externals.joblib")
 )
+_ARRAY = Global("numpy.core.multiarray", "_reconstruct")
 _TENSOR = Global("torch._utils", "_rebuild_tensor_v2")
 _STORAGE = Global("torch.storage", "_load_from_bytes")
 _STORAGES = {
@@ -63,16 +64,7 @@ def run_motion_pickle(data: mmap.mmap | bytes) -> Any:
     Raises:
         RefusedPickleError: damaged, or with names or instructions that motions do not need.
     """
-    return _guarded(_JoblibMachine(data, _RULES))
-
-
-def _guarded(machine: Machine) -> Any:
-    try:
-        return machine.run()
-    except RefusedPickleError:
-        raise
-    except (IndexError, KeyError, TypeError, ValueError, struct.error, OverflowError, MemoryError) as error:
-        raise RefusedPickleError(f"is no sound pickle ({type(error).__name__})") from error
+    return run_machine(_JoblibMachine(data, _RULES))
 
 
 class _JoblibMachine(Machine):
@@ -103,7 +95,7 @@ class _JoblibMachine(Machine):
         if layout.get("numpy_array_alignment_bytes") is not None:
             self._take(self._take(1)[0])
         data = self._take(math.prod(shape) * size)
-        wrapper.function = Global("numpy.core.multiarray", "_reconstruct")
+        wrapper.function = _ARRAY
         wrapper.state = (1, shape, layout["dtype"], layout.get("order") == "F", data)
 
     def _read_objects(self, wrapper: Record) -> None:
@@ -111,11 +103,11 @@ class _JoblibMachine(Machine):
         self._nested += 1
         if self._nested > _MOST_NESTED:
             raise RefusedPickleError(f"holds more than {_MOST_NESTED} arrays of Python objects")
-        inner = Machine(self._file, self._rules._replace(most_instructions=_NESTED_INSTRUCTIONS))
-        inner._at = self._at
+        rules = self._rules._replace(most_instructions=_NESTED_INSTRUCTIONS)
+        inner = Machine(self._file, rules, start=self._at)
         value = inner.run()
-        self._at = inner._at
-        wrapper.function, wrapper.state = Global("numpy.core.multiarray", "_reconstruct"), getattr(value, "state", None)
+        self._at = inner.end
+        wrapper.function, wrapper.state = _ARRAY, getattr(value, "state", None)
 
 
 def item_of(dtype: Any) -> tuple[str, int]:
@@ -185,10 +177,9 @@ def _storage(stored: Any) -> np.ndarray:
         raise ValueError("a tensor without its storage")
     data, at, parts = bytes(stored.arguments[0]), 0, []
     for _ in range(5):
-        machine = Machine(data, _TENSOR_RULES)
-        machine._at = at
-        parts.append(_guarded(machine))
-        at = machine._at
+        machine = Machine(data, _TENSOR_RULES, start=at)
+        parts.append(run_machine(machine))
+        at = machine.end
     reference = parts[3]
     if type(reference) is not Record or reference.function != STORED:
         raise ValueError("a tensor without its storage")

@@ -11,7 +11,7 @@ import numpy as np
 from soma_core.errors import InputError
 from soma_core.io.data_files import DataFile
 from soma_core.io.rotation_shapes import split_shape
-from soma_core.io.smpl_names import PARTS, Space, Tool, part_of, space_of, tool_of
+from soma_core.io.smpl_names import PARTS, RATES, Space, Tool, part_of, space_of, tool_of
 
 __all__ = [
     "BODY_JOINTS", "POSE_JOINTS", "FoundBody", "choose_body", "find_bodies", "holds_poses", "people_in",
@@ -32,7 +32,7 @@ _MOTION_X = {
 }  # fmt: skip
 """Parts of the 322 numbers of Motion-X, in order, and their widths."""
 
-_SHARED = ("gender", "frames", "model", "rate", "betas", "flat", "trans")
+_SHARED = ("gender", "frames", "model", *RATES, "seconds", "betas", "flat", "trans")
 """Parts that may stand beside a body, or further up."""
 
 _CONTAINERS = frozenset(

@@ -16,6 +16,7 @@ from soma_core.io.amass import Gender, SmplMotion, SmplName
 from soma_core.io.data_files import DataFile, open_data
 from soma_core.io.frame_gaps import fill_gaps, kept_frames
 from soma_core.io.rotation_shapes import RotationLayout
+from soma_core.io.smpl_names import RATES
 from soma_core.io.smpl_bodies import (
     FoundBody, choose_body, find_bodies, holds_poses, people_in, shown_names, strange_poses,
     wanted_names,
@@ -31,6 +32,15 @@ _STANDS = 0.7
 """Cosine between the mean upward direction of a body and an axis, from which on it stands along it."""
 
 _GENDERS = {"m": "male", "f": "female", "n": "neutral"} | {name: name for name in get_args(Gender)}
+_VIDEO = 30.0
+"""Frame rate of most videos [1/s]."""
+
+_SAME_RATE = 2e-3
+"""Relative difference of frame rates that are the same, as 29.97 and 30 are."""
+
+_COUNTED, _LASTING = 1.5, 0.02
+"""Frames, and share of them, that a duration may be off by: ends that were cut, rates that were rounded."""
+
 _SAME_BODY = 1e-4
 """Largest spread of coefficients [standard deviations] that is rounding, not another body."""
 
@@ -164,6 +174,11 @@ def _say_choice(file: DataFile, bodies: Sequence[FoundBody], body: FoundBody) ->
         _log.info("%s: %s%s", file.path.name, tool, whose)
 
 
+def _lasts(frames: int, rate: float, seconds: float) -> bool:
+    """Whether so many frames last about so long; a file may count one more or one less."""
+    return abs(frames - seconds * rate) <= max(_COUNTED, _LASTING * frames)
+
+
 class _Reading:
     """One body of a file on its way to a motion."""
 
@@ -175,7 +190,7 @@ class _Reading:
     def motion(self) -> SmplMotion:
         choices = self._choices
         pose = read_pose(self._parts, model=choices.model, layout=choices.rotation_layout)
-        fps = self._rate()
+        fps = self._rate(pose.frames)
         translation = self._translation(pose.frames)
         numbers = self._parts.frame_numbers(pose.frames)
         whole = np.isfinite(pose.rotations).all(axis=(1, 2)) & np.isfinite(translation).all(axis=1)
@@ -194,28 +209,52 @@ class _Reading:
     def _say(self, text: str, *values: object) -> None:
         _log.warning(f"%s: {text}", self._file.path.name, *values)
 
-    def _rate(self) -> float:
-        if self._choices.fps is not None:
-            return float(self._choices.fps)
-        if "rate" in self._parts:
-            rate = self._parts.number("rate")
-            if not (np.isfinite(rate) and rate > 0):
-                raise self._parts.refuse(
-                    "rate", got=f"{rate:g}", expected="a positive number", fix="Pass fps=120 (the true rate)."
-                )
-            return rate
-        if self._tool and self._tool.gender is not None:
-            rate = self._tool.fps or 30.0
-            self._say("no frame rate in the file, %g is taken; pass fps= for another", rate)
-            return rate
-        if self._tool and self._tool.fps:
-            return self._tool.fps
-        raise self._parts.refuse(
-            "rate", got="no frame rate", expected="frames per second", fix="Pass fps=120 (or the true rate)."
-        )
+    def _rate(self, frames: int) -> float:
+        """The frame rate that is asked for, else the file's, else the tool's; said where they contradict."""
+        found = {part: self._parts.number(part) for part in RATES if part in self._parts}
+        asked = self._choices.fps
+        own = next(iter(found.values()), asked)
+        if asked is not None:
+            if own is not None and abs(asked - own) > _SAME_RATE * own:
+                self._say("fps=%g is taken in place of the file's own, %g", asked, own)
+            return float(asked)
+        if not found:
+            return self._usual_rate()
+        seconds = self._parts.number("seconds") if "seconds" in self._parts else 0.0
+        part = next((part for part in found if _lasts(frames, found[part], seconds)), next(iter(found)))
+        rate = found[part]
+        if not (np.isfinite(rate) and rate > 0):
+            raise self._parts.refuse(
+                part, got=f"{rate:g}", expected="a positive number", fix="Pass fps=120 (the true rate)."
+            )
+        others = [
+            f"{self._parts.key(name)}={other:g}" for name, other in found.items() if abs(other - rate) > 1e-3 * rate
+        ]
+        if seconds > 0 and not _lasts(frames, rate, seconds):
+            others.append(f"{self._parts.key('seconds')}={seconds:g}, which {frames} frames last at {frames / seconds:.4g}")
+        if others:
+            key = self._parts.key(part)
+            self._say(
+                "%s=%g is taken for the frame rate, against %s; pass fps= for another", key, rate, " and ".join(others)
+            )
+        return rate
+
+    def _usual_rate(self) -> float:
+        """That of the tool, where the file has none."""
+        tool = self._tool
+        if tool is None or (tool.fps is None and tool.gender is None):
+            raise self._parts.refuse(
+                "rate", got="no frame rate", expected="frames per second", fix="Pass fps=120 (or the true rate)."
+            )
+        rate = tool.fps or _VIDEO
+        self._say("no frame rate in the file, %g is taken; pass fps= for another", rate)
+        return rate
 
     def _gender(self) -> Gender:
         if self._choices.gender:
+            own = self._parts.text("gender").lower() if "gender" in self._parts else ""
+            if _GENDERS.get(own, self._choices.gender) != self._choices.gender:
+                self._say("gender=%s is taken in place of %s, whose betas are another body", self._choices.gender, own)
             return self._choices.gender
         if "gender" in self._parts:
             name = self._parts.text("gender")

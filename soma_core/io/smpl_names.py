@@ -10,7 +10,7 @@ from collections.abc import Collection
 from dataclasses import dataclass
 from typing import Literal
 
-__all__ = ["PARTS", "TOOLS", "Space", "Tool", "part_of", "space_of", "tool_of"]
+__all__ = ["PARTS", "RATES", "TOOLS", "Space", "Tool", "part_of", "space_of", "tool_of"]
 
 Space = Literal["world", "camera"]
 
@@ -37,12 +37,18 @@ PARTS: dict[str, tuple[str, ...]] = {
     "scaling": ("scaling",),
     "frames": ("frame_ids", "frame_id", "frames", "frame", "img_frame_ids", "frame_idx"),
     "model": ("surface_model_type", "model_type", "body_model", "smpl_type"),
-    "rate": ("mocap_framerate", "mocap_frame_rate", "fps", "frame_rate", "framerate", "video_fps"),
+    "rate": ("mocap_framerate",),
+    "rate_2": ("mocap_frame_rate",),
+    "rate_3": ("fps", "frame_rate", "framerate", "video_fps"),
+    "seconds": ("mocap_time_length",),
     "flat": ("flat_hand_mean",),
     "expression": ("expression", "expressions", "expr", "face_expr"),
     "camera": ("camera_crop", "cam", "orig_cam", "camera", "weak_cam"),
 }  # fmt: skip
 """Part -> its names, the one that tells most first."""
+
+RATES = ("rate", "rate_2", "rate_3")
+"""Parts that are a frame rate; files of AMASS have one, others may have several that differ."""
 
 _PART_OF = {name: part for part, names in PARTS.items() for name in names}
 

@@ -28,10 +28,13 @@ class BodyParts:
     def __contains__(self, part: str) -> bool:
         return part in self.body.parts
 
+    def key(self, part: str) -> str:
+        """Where a part is in the file, or what it would be called."""
+        return self.body.parts[part][0] if part in self else PARTS[part][0]
+
     def where(self, part: str) -> str:
         """File and key of a part, for errors."""
-        name = self.body.parts[part][0] if part in self else PARTS[part][0]
-        return f"{self.file.path}: {name}"
+        return f"{self.file.path}: {self.key(part)}"
 
     def refuse(self, part: str, *, got: object, expected: object, fix: str) -> InputError:
         """Make the error that names the file and the key of a part."""
