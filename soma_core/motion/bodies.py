@@ -149,12 +149,14 @@ def _smpl_body(path: Path, options: ConvertOptions, backends: FitBackends) -> Sh
 
 
 def smpl_choices(options: ConvertOptions) -> SmplChoices:
-    """How a file of the SMPL family is read."""
+    """How a file of the SMPL family is read; ``person=all`` of a file of one is that one."""
     given = {
         name: str(value) if isinstance(value, StrEnum) else value
         for name in SMPL_SETTINGS
         if (value := getattr(options, name)) is not None
     }
+    if given.get("person") == "all":
+        del given["person"]
     return SmplChoices(**given | ({"up": f"+{options.up}"} if options.up else {}), fps=options.fps)
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import logging
+import re
 import shutil
 import tempfile
 from collections.abc import Iterator, Mapping
@@ -14,13 +15,18 @@ from typing import Any
 from soma_core.cache import atomic_text
 from soma_core.errors import InputError, SomaError
 from soma_core.io.motion import Motion
+from soma_core.io.smpl_files import people_of
 from soma_core.motion.back import BackConverter
+from soma_core.motion.bodies import SMPL_LAYOUTS
 from soma_core.motion.converter import Converted, Converter
 from soma_core.motion.files import SUFFIXES, ResultFiles, layout_of
 from soma_core.motion.options import ConvertOptions
 from soma_core.options import Picture
 
-__all__ = ["FolderConverted", "convert", "convert_file", "convert_folder"]
+__all__ = ["FolderConverted", "convert", "convert_file", "convert_folder", "convert_people"]
+
+EVERYONE = "all"
+"""Value of the option ``person`` that means each of them."""
 
 _log = logging.getLogger(__name__)
 
@@ -61,6 +67,44 @@ def convert_file(source: str | Path, out: str | Path, *, options: ConvertOptions
     out = Path(out)
     convert = _converter(options or ConvertOptions())
     return convert(Path(source).expanduser(), ResultFiles.of_folder(out), out / "chunks")
+
+
+def convert_people(
+    source: str | Path, out: str | Path, *, options: ConvertOptions | None = None
+) -> dict[str, Converted]:
+    """Convert the motion of every person in a file of the SMPL family, each into a folder of its own.
+
+    Args:
+        source: the file.
+        out: folder of the results, in which each person has one.
+        options: of the conversions; ``person`` does not count.
+
+    Raises:
+        SomaError: the file, or the backend that it needs, cannot be used, or a fit is none.
+    """
+    source, out = Path(source).expanduser(), Path(out)
+    convert = Converter(options or ConvertOptions())
+    return {
+        person: convert.of_person(person)(source, ResultFiles.of_folder(out / name), out / name / "chunks")
+        for person, name in _people(source).items()
+    }
+
+
+def _people(source: Path) -> dict[str, str]:
+    """Whose motions a file holds, and what their results are called; the only one has no name.
+
+    Raises:
+        InputError: it holds none of the SMPL family.
+    """
+    people = people_of(source) if layout_of(source) in SMPL_LAYOUTS else []
+    if not people:
+        raise InputError(
+            f"{source}: person", got="all, of a file without people to choose from",
+            expected="a file of the SMPL family", fix="Leave person out.",
+        )  # fmt: skip
+    names = {person: re.sub(r"[^\w.-]+", "_", person).strip(".") or "person" for person in people}
+    taken = dict.fromkeys(names.values())
+    return names if len(taken) == len(names) else {person: f"{n}_{name}" for n, (person, name) in enumerate(names.items())}
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -113,9 +157,16 @@ def convert_folder(
             fix="Name the folder that holds them.",
         )
     convert, found, rows = _converter(options or ConvertOptions()), FolderConverted(), {}
+    everyone = options is not None and options.person == EVERYONE
     try:
         for number, file in enumerate(files, start=1):
             name = file.relative_to(folder.resolve()).as_posix()
+            if everyone and isinstance(convert, Converter) and (people := _several(file)):
+                for person, called in people.items():
+                    one = f"{name}/{called}"
+                    rows[one], told = _row(convert.of_person(person), file, out, one, found)
+                    _log.info("%d of %d: %s: %s", number, len(files), one, told)
+                continue
             rows[name], told = _row(convert, file, out, name, found)
             level = logging.WARNING if name in found.errors else logging.INFO
             _log.log(level, "%d of %d: %s: %s", number, len(files), name, told)
@@ -124,6 +175,15 @@ def convert_folder(
         atomic_text(out / "report.json", json.dumps(document, indent=2) + "\n")
     shutil.rmtree(out / "chunks", ignore_errors=True)
     return found
+
+
+def _several(file: Path) -> dict[str, str]:
+    """People of a file of several, and their names; none where it holds one or cannot be read."""
+    try:
+        people = _people(file)
+    except SomaError:
+        return {}
+    return people if len(people) > 1 else {}
 
 
 def _converter(options: ConvertOptions) -> Converter | BackConverter:

@@ -13,7 +13,7 @@ from soma_core.cache import atomic_text
 from soma_core.errors import InputError, SomaError
 from soma_core.io.motion import Motion
 from soma_core.io.motion_files import read_motion
-from soma_core.motion.bodies import FITTED, open_body
+from soma_core.motion.bodies import FITTED, SMPL_SETTINGS, open_body
 from soma_core.motion.chunks import refuse_other_settings
 from soma_core.motion.files import Layout, ResultFiles, layout_of, read, write
 from soma_core.motion.fit_job import FitJob, FitPlan, fit_settings, plan_body
@@ -109,6 +109,7 @@ class Converter:
 
     def _carry_over(self, path: Path, layout: Layout, files: ResultFiles) -> Converted:
         """Write the rotations of a file on this skeleton as they are, in metres."""
+        _refuse_smpl_settings(path, layout, self._options)
         motion = read(path, fps=self._options.fps, unit=self._options.unit)
         write(motion, files.motion)
         report = {
@@ -120,6 +121,22 @@ class Converter:
         }
         atomic_text(files.report, json.dumps(report, indent=2) + "\n")
         return Converted(report=report, files=files)
+
+
+def _refuse_smpl_settings(path: Path, layout: Layout, options: ConvertOptions) -> None:
+    """Refuse settings that would change nothing about a file of this skeleton.
+
+    Raises:
+        InputError: one of them is given.
+    """
+    plain = ConvertOptions()
+    for name in SMPL_SETTINGS:
+        value = getattr(options, name)
+        if name not in ("gender", "person") and value != getattr(plain, name):
+            raise InputError(
+                f"{path.name}: {name}", got=str(value), expected=f"none: a {layout} file has no use for it",
+                fix=f"Leave {name} out.",
+            )  # fmt: skip
 
 
 def _known_layout(path: Path) -> Layout:
