@@ -92,7 +92,8 @@ PUBLIC_NAMES = {
     "soma_core.motion": """
         Animated BackendChoice ConvertOptions Converted FitOptions FitPlan FolderConverted FrameRange
         IdentityChoice
-        InversionChoice InvertOptions Picture animate convert convert_file convert_folder convert_people finish_fit
+        InversionChoice InvertOptions Picture animate convert convert_file convert_folder convert_people
+        finish_fit
         fit_chunks invert layout_of load_clip plan_fit read stored_identity write
     """,
     "soma_core.plugin": """

@@ -44,7 +44,7 @@ _TRUSTED = (
 )
 
 _UNPACKERS: dict[bytes, Callable[[IO[bytes]], IO[bytes]]] = {
-    b"\x1f\x8b": lambda file: gzip.GzipFile(fileobj=file),  # type: ignore[dict-item]
+    b"\x1f\x8b": lambda file: gzip.GzipFile(fileobj=file),  # type: ignore[dict-item,return-value]
     b"BZh": bz2.BZ2File,
     b"\xfd7zXZ": lzma.LZMAFile,
     b"\x5d\x00": lzma.LZMAFile,
@@ -159,7 +159,9 @@ def _npy_value(path: Path) -> Any:
         try:
             header = read_array_header(stream, objects=True)
         except ValueError as error:
-            raise AssetError(path, cause=f"no NPY file ({error})", fix="Give a complete .npy file.") from error
+            raise AssetError(
+                path, cause=f"no NPY file ({error})", fix="Give a complete .npy file."
+            ) from error
         if header.dtype.hasobject:
             return _run(path, stream.read())
     if header.begin + header.byte_count != path.stat().st_size:

@@ -45,13 +45,17 @@ def kept_frames(whole: np.ndarray, numbers: np.ndarray | None, name: str) -> tup
     return rows, times
 
 
-def fill_gaps(rotations: np.ndarray, others: Sequence[np.ndarray], times: np.ndarray) -> tuple[np.ndarray, list]:
-    """Rotations (n, joints, 3) and other values (n, ...) at every frame from the first to the last of `times`.
+def fill_gaps(
+    rotations: np.ndarray, others: Sequence[np.ndarray], times: np.ndarray
+) -> tuple[np.ndarray, list]:
+    """Rotations (n, joints, 3) and other values (n, ...) at every frame from the first of `times` on.
 
     Rotations go along the shortest arc, others along straight lines.
     """
     wanted = np.arange(times[-1] + 1)
-    joints = [Slerp(times, Rotation.from_rotvec(column))(wanted).as_rotvec() for column in rotations.swapaxes(0, 1)]
+    joints = [
+        Slerp(times, Rotation.from_rotvec(column))(wanted).as_rotvec() for column in rotations.swapaxes(0, 1)
+    ]
     kept = np.stack(joints, axis=1)
     kept[times] = rotations  # to the bit, and not by another turn around
     filled = []

@@ -15,13 +15,22 @@ from typing import Any
 
 import numpy as np
 
-from soma_core.pickle_machine import STORED, Global, Machine, PickleRules, Record, RefusedPickleError, run_machine
+from soma_core.pickle_machine import (
+    STORED,
+    Global,
+    Machine,
+    PickleRules,
+    Record,
+    RefusedPickleError,
+    run_machine,
+)
 from soma_core.safe_pickle import ALLOWED_NAMES
 
 __all__ = ["array_text", "is_tensor", "run_motion_pickle", "tensor_array"]
 
 _WRAPPERS = frozenset(
-    Global(f"{package}.numpy_pickle", "NumpyArrayWrapper") for package in ("joblib", "sklearn.externals.joblib")
+    Global(f"{package}.numpy_pickle", "NumpyArrayWrapper")
+    for package in ("joblib", "sklearn.externals.joblib")
 )
 _ARRAY = Global("numpy.core.multiarray", "_reconstruct")
 _TENSOR = Global("torch._utils", "_rebuild_tensor_v2")
@@ -89,7 +98,11 @@ class _JoblibMachine(Machine):
             self._read_objects(wrapper)
             return
         shape = layout["shape"]
-        fits = type(shape) is tuple and len(shape) <= _MOST_AXES and all(type(n) is int and n >= 0 for n in shape)
+        fits = (
+            type(shape) is tuple
+            and len(shape) <= _MOST_AXES
+            and all(type(n) is int and n >= 0 for n in shape)
+        )
         if not fits:
             raise RefusedPickleError("is no sound pickle: an array of a shape that is none")
         if layout.get("numpy_array_alignment_bytes") is not None:
@@ -116,7 +129,9 @@ def item_of(dtype: Any) -> tuple[str, int]:
     Raises:
         RefusedPickleError: it is none.
     """
-    name = dtype.arguments[0] if type(dtype) is Record and dtype.function == Global("numpy", "dtype") else None
+    name = (
+        dtype.arguments[0] if type(dtype) is Record and dtype.function == Global("numpy", "dtype") else None
+    )
     found = _ITEM.fullmatch(name) if type(name) is str else None
     if found is None:
         raise RefusedPickleError("is no sound pickle: an array of an unknown type")
@@ -132,7 +147,9 @@ def array_text(record: Record) -> np.ndarray | None:
     state = record.state[-4:] if type(record.state) is tuple and len(record.state) >= 4 else None
     if record.function.name == "scalar" and len(record.arguments) == 2:
         state = ((), record.arguments[0], False, record.arguments[1])
-    dtype = state[1] if state else None
+    if state is None:
+        return None
+    dtype = state[1]
     if type(dtype) is not Record or type(dtype.arguments[0]) is not str or dtype.arguments[0][:1] not in "US":
         return None
     kind, size = item_of(dtype)
@@ -157,7 +174,9 @@ def tensor_array(record: Record) -> np.ndarray:
     try:
         stored, offset, size, stride = record.arguments[:4]
         numbers = _storage(stored)
-        sound = all(type(values) is tuple for values in (size, stride)) and len(size) == len(stride) <= _MOST_AXES
+        sound = (
+            all(type(values) is tuple for values in (size, stride)) and len(size) == len(stride) <= _MOST_AXES
+        )
         if not sound or not all(type(n) is int and n >= 0 for n in (offset, *size, *stride)):
             raise ValueError("a tensor without a sound size")
         last = offset + sum((count - 1) * step for count, step in zip(size, stride, strict=True))

@@ -73,12 +73,16 @@ def axis_angles(values: np.ndarray, width: int, layout: RotationLayout | None) -
 def _from_quaternions(values: np.ndarray, layout: RotationLayout | None) -> tuple[Rotation, str]:
     norms = np.linalg.norm(values, axis=1)
     if np.abs(norms - 1).max() > _ROTATION_TOLERANCE:
-        raise ValueError(f"four numbers of norm {norms[np.abs(norms - 1).argmax()]:.3g} a joint, no quaternions")
+        raise ValueError(
+            f"four numbers of norm {norms[np.abs(norms - 1).argmax()]:.3g} a joint, no quaternions"
+        )
     real = {name: float(np.median(np.abs(values[:, place]))) for name, place in (("wxyz", 0), ("xyzw", 3))}
     told = layout if layout in real else max(real, key=lambda name: real[name])
     if layout not in real and (real[told] < _REST or min(real.values()) > _REST / 2):
         raise ValueError("quaternions whose order cannot be told; pass rotation_layout=wxyz or xyzw")
-    return Rotation.from_quat(values if told == "xyzw" else np.roll(values, -1, axis=1)), f"quaternions {told}"
+    return Rotation.from_quat(
+        values if told == "xyzw" else np.roll(values, -1, axis=1)
+    ), f"quaternions {told}"
 
 
 def _from_six(values: np.ndarray, layout: RotationLayout | None) -> tuple[Rotation, str]:
@@ -108,5 +112,3 @@ def _refuse_no_rotations(matrices: np.ndarray) -> None:
     worst = int(error.argmax())
     if error[worst] > _ROTATION_TOLERANCE or (np.linalg.det(matrices) < 0).any():
         raise ValueError(f"nine numbers a joint that are no rotation (|RᵀR - I| up to {error[worst]:.3g})")
-
-

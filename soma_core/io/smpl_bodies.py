@@ -1,4 +1,4 @@
-"""Bodies of the SMPL family in a file, wherever its tool has put them: whose, in which space, as which parts."""
+"""Bodies of the SMPL family in a file, wherever its tool has put them: whose, in which space, which parts."""
 
 from __future__ import annotations
 
@@ -28,7 +28,8 @@ _JOINTS = {"pose": (*POSE_JOINTS, *BODY_JOINTS), "body": BODY_JOINTS}
 """Joints that parts may have by which a body is told."""
 
 _MOTION_X = {
-    "root": 3, "body": 63, "hands": 90, "jaw": 3, "expression": 50, "face_shape": 100, "trans": 3, "betas": 10,
+    "root": 3, "body": 63, "hands": 90, "jaw": 3, "expression": 50, "face_shape": 100, "trans": 3,
+    "betas": 10,
 }  # fmt: skip
 """Parts of the 322 numbers of Motion-X, in order, and their widths."""
 
@@ -36,8 +37,11 @@ _SHARED = ("gender", "frames", "model", *RATES, "seconds", "betas", "flat", "tra
 """Parts that may stand beside a body, or further up."""
 
 _CONTAINERS = frozenset(
-    """people persons tracks results result data output outputs smpl smplx smplh params net_outputs pred
-    motion motions body person_data smpl_params smplx_params""".split()
+    [
+        *("people", "persons", "tracks", "person_data", "results", "result", "data", "output", "outputs"),
+        *("net_outputs", "pred", "smpl", "smplx", "smplh", "params", "smpl_params", "smplx_params"),
+        *("motion", "motions", "body"),
+    ]
 )
 """Names on the way to a body that tell nothing about whose it is."""
 
@@ -84,7 +88,7 @@ def people_in(bodies: Sequence[FoundBody]) -> list[str]:
 
 
 def holds_poses(file: DataFile) -> bool:
-    """Whether names are those of poses of the SMPL family, readable or not: with a root, or where it stands."""
+    """Whether the names at the top are those of poses of the SMPL family, readable or not."""
     if not isinstance(file.content, dict):
         return False
     named = {found[0] for key in file.content if (found := part_of(str(key))) is not None}
@@ -108,7 +112,7 @@ def choose_body(
     if person is not None and str(person) not in people:
         raise InputError(
             f"{file.path}: person", got=repr(str(person)), expected=f"one of {_listed(people)}",
-            fix=f"Pass person={people[0]}." if people != [""] else "The file holds one body: leave person out.",
+            fix=f"Pass person={people[0]}." if people != [""] else "It holds one body: leave person out.",
         )  # fmt: skip
     own = [body for body in bodies if person is None or body.person == str(person)]
     spaces = {body.space: body for body in own}
@@ -143,7 +147,9 @@ class _Walk:
             yield from self._of_list(node, way, above)
         elif isinstance(node, dict):
             yield from self._of_names(node, way, above)
-        elif not way and (shape := self._file.shape(node)) is not None and len(shape) == 2 and shape[1] == 322:
+        elif (
+            not way and (shape := self._file.shape(node)) is not None and len(shape) == 2 and shape[1] == 322
+        ):
             yield 0, self._motion_x(node)
 
     def _of_list(self, node: Sequence[Any], way: tuple[str, ...], above: Mapping[str, Any]) -> Iterator[Any]:
@@ -163,7 +169,9 @@ class _Walk:
         splits = [split_shape(shape, joints) for shape, joints in shapes if shape is not None]
         return any(split is not None and split[0] in ((), (1,)) for split in splits)
 
-    def _of_names(self, node: Mapping[Any, Any], way: tuple[str, ...], above: Mapping[str, Any]) -> Iterator[Any]:
+    def _of_names(
+        self, node: Mapping[Any, Any], way: tuple[str, ...], above: Mapping[str, Any]
+    ) -> Iterator[Any]:
         tracks = _tracks(node)
         if tracks:
             for person, parts in tracks.items():
@@ -182,7 +190,9 @@ class _Walk:
             if isinstance(value, (dict, list, tuple)):
                 yield from self.bodies(value, (*way, str(key)), shared)
 
-    def _named(self, node: Mapping[Any, Any], way: tuple[str, ...]) -> dict[tuple[str, Space | None], tuple[str, Any]]:
+    def _named(
+        self, node: Mapping[Any, Any], way: tuple[str, ...]
+    ) -> dict[tuple[str, Space | None], tuple[str, Any]]:
         """Parts among the values of a node, the first name of each."""
         ranked: dict[tuple[str, Space | None], tuple[int, str, Any]] = {}
         for key, value in node.items():
@@ -196,7 +206,7 @@ class _Walk:
         return {part: (name, value) for part, (_, name, value) in ranked.items()}
 
     def _layout(self, part: str, value: Any) -> tuple[int | None, bool] | None:
-        """People along the first axis (None: one), and whether time is last; None where these are no rotations."""
+        """People along the first axis (None: one), and whether time is last; None for no rotations."""
         joints = _JOINTS[part]
         if isinstance(value, (list, tuple)) and value:
             first = self._file.shape(value[0])
@@ -248,7 +258,9 @@ class _Walk:
 
 def _tracks(node: Mapping[Any, Any]) -> dict[str, dict[str, tuple[str, Any]]]:
     """Bodies of a result that lists, for every frame, the tracks seen in it (4D-Humans, PHALP)."""
-    frames = [frame for frame in node.values() if isinstance(frame, dict) and isinstance(frame.get("smpl"), list)]
+    frames = [
+        frame for frame in node.values() if isinstance(frame, dict) and isinstance(frame.get("smpl"), list)
+    ]
     if not frames or len(frames) < len(node):
         return {}
     seen: dict[str, dict[str, list[Any]]] = {}
@@ -261,14 +273,22 @@ def _tracks(node: Mapping[Any, Any]) -> dict[str, dict[str, tuple[str, Any]]]:
                 track[part].append(value)
     names = {"root": "smpl/global_orient", "body": "smpl/body_pose", "betas": "smpl/betas", "frames": "time"}
     return {
-        person: {part: (names[part], values) for part, values in parts.items() if all(value is not None for value in values)}
+        person: {
+            part: (names[part], values)
+            for part, values in parts.items()
+            if all(value is not None for value in values)
+        }
         for person, parts in seen.items()
     }
 
 
 def _seen_in(frame: Mapping[Any, Any]) -> Iterator[tuple[str, Mapping[Any, Any]]]:
     """Whose bodies were seen in a frame, and not predicted for it."""
-    bodies, people, unseen = frame["smpl"], frame.get("tid", frame.get("tracked_ids")), frame.get("tracked_time")
+    bodies, people, unseen = (
+        frame["smpl"],
+        frame.get("tid", frame.get("tracked_ids")),
+        frame.get("tracked_time"),
+    )
     if not isinstance(people, (list, tuple)) or len(people) != len(bodies):
         people = range(len(bodies))
     if not isinstance(unseen, (list, tuple)) or len(unseen) != len(bodies):
@@ -279,9 +299,14 @@ def _seen_in(frame: Mapping[Any, Any]) -> Iterator[tuple[str, Mapping[Any, Any]]
 
 
 def strange_poses(file: DataFile) -> Iterator[tuple[str, str]]:
-    """Names of what should be poses and is not, with what they hold; at the top of a file and one level down."""
+    """Names of what should be poses and is not, and what they hold, at the top and one level down."""
     top = file.content if isinstance(file.content, dict) else {}
-    nested = {f"{key}/{name}": value for key, node in top.items() if isinstance(node, dict) for name, value in node.items()}
+    nested = {
+        f"{key}/{name}": value
+        for key, node in top.items()
+        if isinstance(node, dict)
+        for name, value in node.items()
+    }
     for name, value in (*top.items(), *nested.items()):
         part = part_of(str(name).rpartition("/")[2])
         if part is None or part[0] not in ("pose", "body"):

@@ -16,11 +16,17 @@ from soma_core.io.amass import Gender, SmplMotion, SmplName
 from soma_core.io.data_files import DataFile, open_data
 from soma_core.io.frame_gaps import fill_gaps, kept_frames
 from soma_core.io.rotation_shapes import RotationLayout
-from soma_core.io.smpl_names import RATES
 from soma_core.io.smpl_bodies import (
-    FoundBody, choose_body, find_bodies, holds_poses, people_in, shown_names, strange_poses,
+    FoundBody,
+    choose_body,
+    find_bodies,
+    holds_poses,
+    people_in,
+    shown_names,
+    strange_poses,
     wanted_names,
 )
+from soma_core.io.smpl_names import RATES
 from soma_core.io.smpl_parts import BodyParts
 from soma_core.io.smpl_pose import SmplPose, read_pose
 
@@ -156,8 +162,8 @@ def _without_bodies(file: DataFile) -> InputError:
     name, reason = next(strange_poses(file), ("pose", f"only the keys {shown_names(file)}"))
     return InputError(
         f"{file.path}: {name}", got=reason,
-        expected="72 values (smpl), 156 (smplh) or 165 (smplx) a frame, or as many joints as matrices, quaternions "
-        f"or 6D; keys: {wanted_names()}",
+        expected="72 values (smpl), 156 (smplh) or 165 (smplx) a frame, or as many joints as matrices, "
+        f"quaternions or 6D; keys: {wanted_names()}",
         fix="Rename the keys, or convert another file.",
     )  # fmt: skip
 
@@ -169,7 +175,14 @@ def _say_choice(file: DataFile, bodies: Sequence[FoundBody], body: FoundBody) ->
     if len(spaces) > 1:
         space = body.space or next(name for name in ("world", "camera") if name not in spaces)
         other = "camera" if space == "world" else "world"
-        _log.info("%s: %s%s: motion in the %s; coordinates=%s for the other", file.path.name, tool, whose, space, other)
+        _log.info(
+            "%s: %s%s: motion in the %s; coordinates=%s for the other",
+            file.path.name,
+            tool,
+            whose,
+            space,
+            other,
+        )
     elif body.tool or whose:
         _log.info("%s: %s%s", file.path.name, tool, whose)
 
@@ -196,7 +209,9 @@ class _Reading:
         whole = np.isfinite(pose.rotations).all(axis=(1, 2)) & np.isfinite(translation).all(axis=1)
         unseen = "trans" if np.isfinite(pose.rotations).all() and "trans" in self._parts else pose.leading
         rows, times = kept_frames(whole, numbers, self._parts.where(unseen))
-        rotations, translation = self._without_gaps(pose.rotations[rows], translation[rows], times, fps, len(whole))
+        rotations, translation = self._without_gaps(
+            pose.rotations[rows], translation[rows], times, fps, len(whole)
+        )
         flat = choices.flat_hand_mean
         return SmplMotion(
             model=pose.model, rotations=rotations, translation=translation, betas=self._betas(pose),
@@ -228,14 +243,22 @@ class _Reading:
                 part, got=f"{rate:g}", expected="a positive number", fix="Pass fps=120 (the true rate)."
             )
         others = [
-            f"{self._parts.key(name)}={other:g}" for name, other in found.items() if abs(other - rate) > 1e-3 * rate
+            f"{self._parts.key(name)}={other:g}"
+            for name, other in found.items()
+            if abs(other - rate) > 1e-3 * rate
         ]
         if seconds > 0 and not _lasts(frames, rate, seconds):
-            others.append(f"{self._parts.key('seconds')}={seconds:g}, which {frames} frames last at {frames / seconds:.4g}")
+            others.append(
+                f"{self._parts.key('seconds')}={seconds:g}, which {frames} frames last at "
+                f"{frames / seconds:.4g}"
+            )
         if others:
             key = self._parts.key(part)
             self._say(
-                "%s=%g is taken for the frame rate, against %s; pass fps= for another", key, rate, " and ".join(others)
+                "%s=%g is taken for the frame rate, against %s; pass fps= for another",
+                key,
+                rate,
+                " and ".join(others),
             )
         return rate
 
@@ -244,7 +267,10 @@ class _Reading:
         tool = self._tool
         if tool is None or (tool.fps is None and tool.gender is None):
             raise self._parts.refuse(
-                "rate", got="no frame rate", expected="frames per second", fix="Pass fps=120 (or the true rate)."
+                "rate",
+                got="no frame rate",
+                expected="frames per second",
+                fix="Pass fps=120 (or the true rate).",
             )
         rate = tool.fps or _VIDEO
         self._say("no frame rate in the file, %g is taken; pass fps= for another", rate)
@@ -254,7 +280,11 @@ class _Reading:
         if self._choices.gender:
             own = self._parts.text("gender").lower() if "gender" in self._parts else ""
             if _GENDERS.get(own, self._choices.gender) != self._choices.gender:
-                self._say("gender=%s is taken in place of %s, whose betas are another body", self._choices.gender, own)
+                self._say(
+                    "gender=%s is taken in place of %s, whose betas are another body",
+                    self._choices.gender,
+                    own,
+                )
             return self._choices.gender
         if "gender" in self._parts:
             name = self._parts.text("gender")
@@ -301,7 +331,10 @@ class _Reading:
         rows = rows[np.isfinite(rows).all(axis=1)]
         if not len(rows):
             raise self._parts.refuse(
-                "betas", got="NaN or infinity", expected="finite numbers", fix="Pass betas=[0,0,0] or the true ones."
+                "betas",
+                got="NaN or infinity",
+                expected="finite numbers",
+                fix="Pass betas=[0,0,0] or the true ones.",
             )
         if np.ptp(rows, axis=0).max(initial=0) <= _SAME_BODY:
             return rows[0]
@@ -310,8 +343,9 @@ class _Reading:
             "betas of %d frames differ by up to %.2g: their %s is the body; betas_from=mean, median or first",
             len(rows), np.ptp(rows, axis=0).max(), how,
         )  # fmt: skip
-        found = {"mean": np.mean, "median": np.median}.get(how, lambda values, axis: values[0])
-        return np.asarray(found(rows, axis=0))
+        if how == "first":
+            return rows[0]
+        return np.asarray(np.median(rows, axis=0) if how == "median" else rows.mean(axis=0))
 
     def _without_gaps(
         self, rotations: np.ndarray, translation: np.ndarray, times: np.ndarray, fps: float, rows: int
@@ -330,12 +364,15 @@ class _Reading:
         if longest > self._choices.longest_gap * fps:
             at = int(times[steps.argmax()])
             raise InputError(
-                f"{self._file.path}: frames", got=f"{longest} frames missing ({longest / fps:.3g} s) after frame {at}",
+                f"{self._file.path}: frames",
+                got=f"{longest} frames missing ({longest / fps:.3g} s) after frame {at}",
                 expected=f"gaps of at most longest_gap={self._choices.longest_gap:g} s",
-                fix=f"Pass longest_gap={np.ceil(100 * longest / fps) / 100:g} to interpolate it, or gaps=drop.",
+                fix=f"Pass longest_gap={np.ceil(100 * longest / fps) / 100:g} to fill it, or gaps=drop.",
             )  # fmt: skip
         self._say(
-            "%d missing frames are interpolated, at most %d in a row; gaps=drop leaves them out", missing, longest
+            "%d missing frames are interpolated, at most %d in a row; gaps=drop leaves them out",
+            missing,
+            longest,
         )
         filled, (path,) = fill_gaps(rotations, [translation], times)
         return filled, path
@@ -355,5 +392,7 @@ class _Reading:
         axis = 1 + int(np.abs(upward[1:]).argmax())
         sign = "+" if upward[axis] > 0 else "-"
         found = f"{sign}{'xyz'[axis]}" if abs(upward[axis]) > _STANDS else "+y"
-        self._say("the file does not say its axes: %s is taken for up, as the body stands; up= for another", found)
+        self._say(
+            "the file does not say its axes: %s is taken for up, as the body stands; up= for another", found
+        )
         return found

@@ -53,7 +53,8 @@ RATES = ("rate", "rate_2", "rate_3")
 _PART_OF = {name: part for part, names in PARTS.items() for name in names}
 
 _EXACT: dict[str, tuple[str, Space | None] | None] = {
-    "world_trans": ("trans", "world"), "world_transl": ("trans", "world"), "world_global_rots": ("root", "world"),
+    "world_trans": ("trans", "world"), "world_transl": ("trans", "world"),
+    "world_global_rots": ("root", "world"),
     "cam_trans": ("trans", "camera"), "cam_t": ("trans", "camera"), "camera_translation": ("trans", "camera"),
     "orig_cam": ("camera", None), "pred_cam": ("camera", None),
     "cam_poses": None, "cam_pose": None, "camera_pose": None, "camera_poses": None,

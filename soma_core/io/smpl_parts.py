@@ -51,7 +51,7 @@ class BodyParts:
         except ValueError as error:
             raise self.refuse(
                 part, got=f"an unreadable array ({error})", expected="a plain numeric or text array",
-                fix="If you trust the file, load it where it was written and save plain arrays with np.savez.",
+                fix="If you trust the file, load it where it was written and save plain arrays: np.savez.",
             ) from error  # fmt: skip
         if index is not None and array.ndim and len(array) == count and value is self.body.parts[part][1]:
             array = array[index]
@@ -75,7 +75,12 @@ class BodyParts:
         if values.size == width:
             return np.broadcast_to(values.reshape(1, width), (frames, width)).copy()
         kept = tuple(size for size in values.shape if size != 1)
-        if values.size != frames * width or kept not in ((frames, width), (width,), (frames * width,), (frames,)):
+        if values.size != frames * width or kept not in (
+            (frames, width),
+            (width,),
+            (frames * width,),
+            (frames,),
+        ):
             raise self.refuse(
                 part, got=f"shape {values.shape}", expected=f"{width} numbers a frame, ({frames}, {width})",
                 fix="Check that all keys of the file have the same number of frames.",

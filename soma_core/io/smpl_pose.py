@@ -139,10 +139,15 @@ class _Reader:
             found, told = axis_angles(values, width, self._layout)
         except ValueError as error:
             raise self._parts.refuse(
-                part, got=str(error), expected="rotations", fix="Pass rotation_layout=wxyz, xyzw, rows or columns."
+                part,
+                got=str(error),
+                expected="rotations",
+                fix="Pass rotation_layout=wxyz, xyzw, rows or columns.",
             ) from error
         if width == 6 and self._layout is None:
-            _log.warning("%s: %s; rotation_layout=columns or rows for the other", self._parts.where(part), told)
+            _log.warning(
+                "%s: %s; rotation_layout=columns or rows for the other", self._parts.where(part), told
+            )
         if width == 4 and self._layout is None:
             self._layout = told.rpartition(" ")[2]  # type: ignore[assignment]  # the same in all parts
         if width != 3:
@@ -181,7 +186,10 @@ def _told_model(parts: BodyParts, groups: dict[str, np.ndarray]) -> SmplName:
         found = next((model for model in models if plain.startswith(model)), None)
         if found is None:
             raise parts.refuse(
-                "model", got=repr(name), expected="smpl, smplh or smplx", fix="Pass model=smplx (or the true one)."
+                "model",
+                got=repr(name),
+                expected="smpl, smplh or smplx",
+                fix="Pass model=smplx (or the true one).",
             )
         if "locked" in plain:
             _log.warning(
@@ -206,6 +214,6 @@ def _say_differences(parts: BodyParts, model: SmplName, groups: dict[str, np.nda
         _log.info("%s: no jaw and eyes in the file: they stay still", name)
     moved = [group for group in groups if group not in wanted and np.nanmax(np.abs(groups[group])) > _STILL]
     if moved:
-        _log.warning("%s: %s has no joints for the %s of the file, which are dropped", name, model, " and ".join(moved))
-
-
+        _log.warning(
+            "%s: %s has no joints for the %s of the file, which are dropped", name, model, " and ".join(moved)
+        )

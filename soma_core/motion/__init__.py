@@ -56,7 +56,13 @@ __all__ = [
 
 _HOMES = {
     "soma_core.motion.animated": ["Animated", "animate", "load_clip"],
-    "soma_core.motion.conversion": ["FolderConverted", "convert", "convert_file", "convert_folder", "convert_people"],
+    "soma_core.motion.conversion": [
+        "FolderConverted",
+        "convert",
+        "convert_file",
+        "convert_folder",
+        "convert_people",
+    ],
     "soma_core.motion.converter": ["Converted", "finish_fit", "invert", "plan_fit"],
     "soma_core.motion.files": ["layout_of", "read", "write"],
     "soma_core.motion.fit_job": ["FitPlan", "fit_chunks"],

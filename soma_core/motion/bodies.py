@@ -40,8 +40,8 @@ SMPL_LAYOUTS = ("amass", "smpl")
 """Layouts whose bodies are of the SMPL family."""
 
 SMPL_SETTINGS = (
-    "gender", "betas", "betas_from", "model", "person", "coordinates", "rotation_layout", "flat_hand_mean", "gaps",
-    "longest_gap",
+    "gender", "betas", "betas_from", "model", "person", "coordinates", "rotation_layout", "flat_hand_mean",
+    "gaps", "longest_gap",
 )  # fmt: skip
 """Options that only these layouts heed."""
 
@@ -164,7 +164,9 @@ def _reading(options: ConvertOptions) -> dict[str, Any]:
     """Settings of the reading that are not those of every file, for the report."""
     plain = SmplChoices()
     read = vars(smpl_choices(options))
-    return {name: read[name] for name in SMPL_SETTINGS if name != "gender" and read[name] != getattr(plain, name)}
+    return {
+        name: read[name] for name in SMPL_SETTINGS if name != "gender" and read[name] != getattr(plain, name)
+    }
 
 
 def _model_pose(
@@ -180,7 +182,8 @@ def _model_pose(
         mean = backend.mean_hands
         if mean is None:
             raise InputError(
-                f"{path}: flat_hand_mean", got=f"false, and a {motion.model} model without hands_meanl, hands_meanr",
+                f"{path}: flat_hand_mean",
+                got=f"false, and a {motion.model} model without hands_meanl, hands_meanr",
                 expected="the official model file, which holds the mean hands",
                 fix=f"Run: soma backends convert {motion.model} FILE. Or pass flat_hand_mean=true.",
             )  # fmt: skip

@@ -104,7 +104,11 @@ def _people(source: Path) -> dict[str, str]:
         )  # fmt: skip
     names = {person: re.sub(r"[^\w.-]+", "_", person).strip(".") or "person" for person in people}
     taken = dict.fromkeys(names.values())
-    return names if len(taken) == len(names) else {person: f"{n}_{name}" for n, (person, name) in enumerate(names.items())}
+    return (
+        names
+        if len(taken) == len(names)
+        else {person: f"{n}_{name}" for n, (person, name) in enumerate(names.items())}
+    )
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

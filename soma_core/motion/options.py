@@ -126,7 +126,9 @@ class ConvertOptions(FitOptions):
         super().__post_init__()
         sought = None if self.identity.method == "known" else str(self.identity.method)
         unused: dict[str, object] = {"identity.method": sought, "most_betas": self.most_betas}
-        unused |= {name: getattr(self, name) for name in ("person", "model", "coordinates", "rotation_layout")}
+        unused |= {
+            name: getattr(self, name) for name in ("person", "model", "coordinates", "rotation_layout")
+        }
         why = f"to={self.to}"
         if self.to == "soma":
             placed = None if self.translation == "motion" else str(self.translation)

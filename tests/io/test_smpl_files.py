@@ -36,7 +36,9 @@ each_layout = pytest.mark.parametrize("layout", LAYOUTS, ids=lambda layout: layo
 
 def same_turns(found, expected):
     """Compare rotations, not the vectors that stand for them."""
-    difference = Rotation.from_rotvec(found.reshape(-1, 3)).inv() * Rotation.from_rotvec(expected.reshape(-1, 3))
+    difference = Rotation.from_rotvec(found.reshape(-1, 3)).inv() * Rotation.from_rotvec(
+        expected.reshape(-1, 3)
+    )
     assert difference.magnitude().max() < SINGLE
 
 
@@ -74,7 +76,9 @@ def test_quaternions_in_either_order_are_told_by_their_size(tmp_path, order):
 
 def test_quaternions_whose_order_cannot_be_told_are_refused(tmp_path):
     wild = Rotation.random(21 * FRAMES, random_state=0).as_quat().reshape(FRAMES, 21, 4)
-    with pytest.raises(InputError, match=r"body_pose: got quaternions whose order.*Pass rotation_layout=wxyz"):
+    with pytest.raises(
+        InputError, match=r"body_pose: got quaternions whose order.*Pass rotation_layout=wxyz"
+    ):
         read(tmp_path, smplx_names(TURNS, body_pose=wild))
 
 
@@ -116,7 +120,7 @@ def test_the_world_is_preferred_and_the_camera_chosen(tmp_path, caplog):
     assert read_smpl(tmp_path / "m.pkl").up == "+y"
     assert "motion in the world; coordinates=camera" in caplog.text
     camera = read_smpl(tmp_path / "m.pkl", SmplChoices(coordinates="camera"))
-    np.testing.assert_allclose(camera.translation, PATH + [0, 0, 5], atol=SINGLE)
+    np.testing.assert_allclose(camera.translation, PATH + np.array([0, 0, 5]), atol=SINGLE)
     assert camera.up == "-y"
     local = {name: value for name, value in wham()[0].items() if "world" not in name}
     save_pickle(tmp_path / "m.pkl", local)
@@ -173,7 +177,9 @@ def test_gaps_are_interpolated_or_left_out(tmp_path, caplog):
     steps = (turned[1:4].inv() * turned[2:5]).magnitude()
     np.testing.assert_allclose(steps, steps[0], atol=SINGLE)
     assert read_smpl(tmp_path / "m.pkl", SmplChoices(gaps="drop")).frame_count == 3
-    with pytest.raises(InputError, match=r"2 frames missing \(0.2 s\) after frame 1.*longest_gap=0.2 .*gaps=drop"):
+    with pytest.raises(
+        InputError, match=r"2 frames missing \(0.2 s\) after frame 1.*longest_gap=0.2 .*gaps=drop"
+    ):
         read_smpl(tmp_path / "m.pkl", SmplChoices(longest_gap=0.1))
 
 
@@ -203,7 +209,9 @@ def test_rows_in_any_order_are_brought_into_time(tmp_path):
 @pytest.mark.parametrize(("rest", "up"), [(0, "+y"), (90, "+z"), (180, "-y"), (-90, "-z")])
 def test_the_axes_of_a_world_are_told_by_how_the_body_stands(tmp_path, caplog, rest, up):
     turns = TURNS.copy()
-    turns[:, 0] = (Rotation.from_euler("x", rest, degrees=True) * Rotation.from_rotvec(TURNS[:, 0])).as_rotvec()
+    turns[:, 0] = (
+        Rotation.from_euler("x", rest, degrees=True) * Rotation.from_rotvec(TURNS[:, 0])
+    ).as_rotvec()
     motion = read(tmp_path, smplx_names(turns))
     assert motion.up == up
     assert f"the file does not say its axes: {up} is taken for up" in caplog.text
@@ -216,7 +224,9 @@ def test_hands_as_components_are_left_straight_and_said(tmp_path, caplog):
     assert "12 numbers a frame are no rotations of 15 joints" in caplog.text
 
 
-@pytest.mark.parametrize(("own", "asked", "flat_hands"), [(None, None, True), (False, None, False), (True, False, False)])
+@pytest.mark.parametrize(
+    ("own", "asked", "flat_hands"), [(None, None, True), (False, None, False), (True, False, False)]
+)
 def test_what_zero_means_for_hands_is_kept(tmp_path, own, asked, flat_hands):
     content = smplx_names(TURNS) | ({} if own is None else {"flat_hand_mean": own})
     assert read(tmp_path, content, flat_hand_mean=asked).flat_hands is flat_hands
@@ -251,8 +261,14 @@ def test_joints_that_a_model_lacks_are_said(tmp_path, caplog):
 @pytest.mark.parametrize(
     ("changes", "said"),
     [
-        ({"body_pose": np.zeros((FRAMES, 60))}, r"body_pose: got shape \(5, 60\), expected 72 values \(smpl\)"),
-        ({"global_orient": np.zeros((2, 3))}, r"global_orient: got shape \(2, 3\), expected 5 frames of 1 joints"),
+        (
+            {"body_pose": np.zeros((FRAMES, 60))},
+            r"body_pose: got shape \(5, 60\), expected 72 values \(smpl\)",
+        ),
+        (
+            {"global_orient": np.zeros((2, 3))},
+            r"global_orient: got shape \(2, 3\), expected 5 frames of 1 joints",
+        ),
         ({"transl": np.zeros((4, 3))}, r"transl: got shape \(4, 3\), expected 3 numbers a frame"),
         ({"transl": np.array(["a"] * FRAMES)}, r"transl: got shape \(5,\), dtype <U1, expected numbers"),
         ({"betas": np.zeros((2, 10))}, "betas: got 2 rows, expected one row"),
@@ -265,14 +281,18 @@ def test_what_is_no_motion_is_refused_by_its_key(tmp_path, changes, said):
 
 
 def test_other_names_are_listed_beside_the_wanted_ones(tmp_path):
-    with pytest.raises(InputError, match=r"pose: got only the keys joints \(5, 3\), expected .*keys: pose: .*poses"):
+    with pytest.raises(
+        InputError, match=r"pose: got only the keys joints \(5, 3\), expected .*keys: pose: .*poses"
+    ):
         read(tmp_path, {"joints": np.zeros((FRAMES, 3))})
     assert smpl_layout(tmp_path / "m.npz") is None
 
 
 def test_pickles_that_ask_for_more_than_data_are_refused_by_name(tmp_path):
     save_pickle(tmp_path / "m.pkl", {"pose": flat(SMPL), "x": dataclasses.field})
-    with pytest.raises(AssetError, match=r"asks for dataclasses.field, which is no part of a motion.*np.savez"):
+    with pytest.raises(
+        AssetError, match=r"asks for dataclasses.field, which is no part of a motion.*np.savez"
+    ):
         read_smpl(tmp_path / "m.pkl")
 
 

@@ -38,7 +38,8 @@ class ModelFile:
         regressor: (J, v) joints from vertices, rows sum to 1.
         weights: (v, J) skinning weights.
         faces: (t, 3) int64.
-        mean_hands: (90,) axis-angle values of the fingers' mean pose, left hand first; None where the file has none.
+        mean_hands: (90,) axis-angle values of the fingers' mean pose, left hand first; None where there are
+            none.
     """
 
     family: Family
