@@ -17,8 +17,7 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 __all__ = [
-    "STORED", "Global", "Machine", "PickleRules", "Record", "RefusedPickleError", "run_machine",
-    "run_pickle",
+    "STORED", "Global", "Machine", "PickleRules", "Record", "RefusedPickleError", "run_machine", "run_pickle",
 ]  # fmt: skip
 
 _LONG_TEXT = 1024
@@ -111,17 +110,12 @@ _SETS = (Global("builtins", "set"), Global("__builtin__", "set"))
 class Machine:
     """A pickle under way."""
 
-    def __init__(self, file: mmap.mmap | bytes, rules: PickleRules, *, start: int = 0) -> None:
-        self._file, self._data, self._at = file, memoryview(file), start
+    def __init__(self, file: mmap.mmap | bytes, rules: PickleRules) -> None:
+        self._file, self._data, self._at = file, memoryview(file), 0
         self._rules, self._integer_keys = rules, 0
         self._stack: list[Any] = []
         self._marks: list[int] = []
         self._memo: dict[int, Any] = {}
-
-    @property
-    def end(self) -> int:
-        """Where the program has come to in the file."""
-        return self._at
 
     def run(self) -> Any:
         """Follow the program to its end and give what it leaves."""

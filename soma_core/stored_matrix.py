@@ -35,7 +35,7 @@ class StoredMatrix:
     shape: tuple[int, ...]
 
     def csr(self) -> scipy.sparse.csr_array:
-        """The matrix in rows, entries at one place added.
+        """The matrix in rows, entries at one place added, half precision as float32.
 
         Raises:
             ValueError: indices that leave the matrix or its values, or sizes that do not belong together.
@@ -58,7 +58,9 @@ class StoredMatrix:
         rows = rows[:, None, None] * block[0] + inside[0][:, None]
         columns = columns[:, None, None] * block[1] + inside[1]
         rows, columns = (part.ravel() for part in np.broadcast_arrays(rows, columns))
-        return scipy.sparse.csr_array((self.values.ravel(), (rows, columns)), shape=self.shape)
+        half = self.values.dtype == np.float16  # which scipy does not know
+        values = self.values.astype(np.float32) if half else self.values
+        return scipy.sparse.csr_array((values.ravel(), (rows, columns)), shape=self.shape)
 
     def dense(self) -> np.ndarray:
         """The matrix with its zeros.

@@ -16,8 +16,10 @@ from typing import Any
 from omegaconf import DictConfig, OmegaConf
 
 from soma_core.cache import atomic_text
+from soma_core.errors import SomaError
 from soma_core.paths import assets_dir
 from soma_core.plugin.registry import default_registry
+from soma_core.rig.manifest import read_manifest
 
 __all__ = ["describe_environment", "run_log", "write_provenance"]
 
@@ -27,9 +29,8 @@ _log = logging.getLogger(__name__)
 def _rig_revision() -> str:
     """Revision of the rig that the assets declare; empty where they are not built."""
     try:
-        manifest = json.loads((assets_dir() / "MANIFEST.json").read_text(encoding="utf-8"))
-        return str(manifest["rig_revision"])
-    except (OSError, ValueError, KeyError, TypeError) as error:
+        return str(read_manifest(assets_dir()).rig_revision)
+    except SomaError as error:
         _log.warning("the assets name no rig revision (%s); run: soma assets verify", error)
         return ""
 

@@ -17,13 +17,14 @@ from soma_core.correctives.weights import (
 )
 from soma_core.errors import AssetError
 from soma_core.geometry.sparse import SparseRows
-from soma_core.paths import assets_dir
-from soma_core.rig.manifest import CORRECTIVES_NAME
+from soma_core.rig.manifest import CORRECTIVES_NAME, RESTORE, shipped_file
 from soma_core.rig.mesh import CanonicalMesh
 from soma_core.rig.skeleton import Rig
 from soma_core.topology.lod_transfer import offset_rows
 
 __all__ = ["Correctives", "find_correctives", "load_correctives", "skeleton_length"]
+
+_RESTORE = f"{RESTORE}; a model of your own is taken by correctives=FILE"
 
 
 class Correctives(torch.nn.Module):
@@ -103,11 +104,11 @@ def find_correctives(given: Path | str | None, *, shipped: bool) -> Path | None:
         shipped: whether ``auto`` may be the shipped one.
 
     Raises:
-        AssetError: a file that was named is not there.
+        AssetError: a file that was named is not there, or the shipped one was changed.
     """
     if given is None or (given == "auto" and not shipped):
         return None
-    path = assets_dir() / CORRECTIVES_NAME if given == "auto" else Path(given)
+    path = shipped_file(CORRECTIVES_NAME, fix=_RESTORE) if given == "auto" else Path(given)
     if path.is_file():
         return path
     if given == "auto":

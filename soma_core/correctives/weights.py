@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import pickle
 import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -17,8 +16,9 @@ from torch import Tensor
 from soma_core.cache import atomic_write
 from soma_core.correctives.features import local_bind_rotations
 from soma_core.errors import AssetError
-from soma_core.files import refuse_unreadable
 from soma_core.rig.skeleton import Rig
+from soma_core.stored_matrix import StoredMatrix
+from soma_core.tensor_archive import read_tensor_archive
 from soma_core.topology.frames import METRES, METRES_PER_UNIT
 
 __all__ = [
@@ -31,7 +31,9 @@ __all__ = [
 
 _METRES = METRES_PER_UNIT | METRES
 _KEYS = ("C_max", "use_tanh", "bindpose", "W1", "W2", "M1_mask", "M2_mask", "meta")
-_MOST_BYTES = 2**30
+_MOST_ENTRIES = 2**24
+"""Of a stage; the shipped second one has 1.2 million."""
+
 _BIND_TOLERANCE = 1e-3
 """Correctives of a rig whose bind pose differs by more are those of another rig."""
 
@@ -116,27 +118,23 @@ def _quiet(make: Any, *arguments: Any, **options: Any) -> Any:
 
 
 def read_weights(path: Path | str) -> CorrectiveWeights:
-    """Read a checkpoint; nothing in it is executed. Matrices may be COO, CSR, BSR or dense.
+    """Read a checkpoint; nothing in it is executed. Matrices may be sparse, in any layout, or dense.
 
     Weights are multiplied by their masks, so that nothing outside a mask can move.
 
     Raises:
         AssetError: missing, damaged, without a key, or with shapes that do not belong together.
     """
-    refuse_unreadable(path, fix=_TRAIN, most_bytes=_MOST_BYTES)
-    try:
-        content = _quiet(torch.load, path, weights_only=True, map_location="cpu")
-    except (pickle.UnpicklingError, RuntimeError, EOFError, ValueError, KeyError, OSError) as error:
-        raise _refusal(path, f"not a checkpoint of plain tensors ({str(error)[:200]})") from error
+    content = read_tensor_archive(path, fix=_TRAIN, sparse=StoredMatrix.csr)
     missing = [key for key in _KEYS if not isinstance(content, dict) or key not in content]
     if missing:
         raise _refusal(path, f"without the keys {', '.join(missing)}")
     unit = content.get("unit", "centimeters")
-    if unit not in _METRES:
+    if type(unit) is not str or unit not in _METRES:
         raise _refusal(path, f"in the unit {unit!r}, which is none of {', '.join(_METRES)}")
     try:
         return _assembled(content, _METRES[unit])
-    except (ValueError, TypeError, RuntimeError, AttributeError) as error:
+    except (ValueError, TypeError, AttributeError, IndexError, OverflowError) as error:
         raise _refusal(path, str(error)[:200]) from error
 
 
@@ -146,8 +144,10 @@ def _refusal(path: Path | str, cause: str) -> AssetError:
 
 def _assembled(content: Mapping[str, Any], metres: float) -> CorrectiveWeights:
     """Check the shapes and multiply the masks in; ValueError says what does not fit."""
-    channels, bind = int(content["C_max"]), content["bindpose"].double().numpy()
+    channels, bind = int(content["C_max"]), np.asarray(content["bindpose"], np.float64)
     joints = len(bind)
+    if not np.isfinite(bind).all():
+        raise ValueError("bindpose holds numbers that are not finite")
     joint_mask, vertex_mask = (_matrix(content[key], key) for key in ("M1_mask", "M2_mask"))
     first, second = _matrix(content["W1"], "W1"), _matrix(content["W2"], "W2")
     expected: dict[str, tuple[tuple[int, ...], list[tuple[int, ...]]]] = {
@@ -187,23 +187,24 @@ def _masked(
     return found
 
 
-def _matrix(tensor: Tensor, key: str) -> scipy.sparse.csr_array:
+def _matrix(stored: Any, key: str) -> scipy.sparse.csr_array:
     """A stored matrix as float64 CSR."""
-    layout = tensor.layout
-    if layout in (torch.sparse_csr, torch.sparse_bsr):
-        parts = (tensor.values(), tensor.col_indices(), tensor.crow_indices())
-        data, columns, starts = (part.numpy() for part in parts)
-        make = scipy.sparse.csr_array if layout == torch.sparse_csr else scipy.sparse.bsr_array
-        found = make((data.astype(np.float64), columns, starts), shape=tuple(tensor.shape)).tocsr()
-    else:
-        entries = (tensor if layout == torch.sparse_coo else tensor.to_sparse_coo()).coalesce()
-        rows, columns = entries.indices().numpy()
-        values = entries.values().double().numpy()
-        found = scipy.sparse.csr_array((values, (rows, columns)), shape=tuple(tensor.shape))
+    if not isinstance(stored, scipy.sparse.csr_array):
+        stored = _sparse(stored, key)
+    found = scipy.sparse.csr_array(stored, dtype=np.float64)
     if not np.isfinite(found.data).all():
         raise ValueError(f"{key} holds numbers that are not finite")
     found.eliminate_zeros()
-    return scipy.sparse.csr_array(found)
+    return found
+
+
+def _sparse(dense: Any, key: str) -> scipy.sparse.csr_array:
+    if not isinstance(dense, np.ndarray) or dense.ndim != 2 or dense.dtype.kind not in "fiub":
+        raise ValueError(f"{key} is no matrix of numbers")
+    if np.count_nonzero(dense) > _MOST_ENTRIES:
+        raise ValueError(f"{key} holds more than {_MOST_ENTRIES} numbers other than zero")
+    place = np.nonzero(dense)
+    return scipy.sparse.csr_array((dense[place].astype(np.float64), place), shape=dense.shape)
 
 
 def check_bind_pose(path: Path | str, weights: CorrectiveWeights, rig: Rig) -> None:

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-import json
 import struct
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+
+from soma_core.json_file import parse_json
 
 __all__ = ["GlbFile"]
 
@@ -38,7 +39,7 @@ class GlbFile:
         size, kind = struct.unpack_from("<I4s", self._data.data, 12)
         if kind != b"JSON":
             raise ValueError(f"its first chunk is {kind!r}, not JSON")
-        self.document: dict[str, Any] = json.loads(self._data[20 : 20 + size].tobytes())
+        self.document: dict[str, Any] = parse_json(self._data[20 : 20 + size].tobytes())
         self._begin = 28 + size
         if len(self.document.get("nodes", ())) > _MOST_NODES:
             raise ValueError(f"it holds {len(self.document['nodes'])} nodes, more than {_MOST_NODES}")

@@ -76,6 +76,19 @@ def run_motion_pickle(data: mmap.mmap | bytes) -> Any:
     return run_machine(_JoblibMachine(data, _RULES))
 
 
+class _PartMachine(Machine):
+    """A pickle that begins at `start` of a file and leaves the rest to others."""
+
+    def __init__(self, file: mmap.mmap | bytes, rules: PickleRules, *, start: int) -> None:
+        super().__init__(file, rules)
+        self._at = start
+
+    @property
+    def end(self) -> int:
+        """Where the pickle ended in the file."""
+        return self._at
+
+
 class _JoblibMachine(Machine):
     """A pickle whose arrays may follow their stand-ins in the stream."""
 
@@ -117,7 +130,7 @@ class _JoblibMachine(Machine):
         if self._nested > _MOST_NESTED:
             raise RefusedPickleError(f"holds more than {_MOST_NESTED} arrays of Python objects")
         rules = self._rules._replace(most_instructions=_NESTED_INSTRUCTIONS)
-        inner = Machine(self._file, rules, start=self._at)
+        inner = _PartMachine(self._file, rules, start=self._at)
         value = inner.run()
         self._at = inner.end
         wrapper.function, wrapper.state = _ARRAY, getattr(value, "state", None)
@@ -196,7 +209,7 @@ def _storage(stored: Any) -> np.ndarray:
         raise ValueError("a tensor without its storage")
     data, at, parts = bytes(stored.arguments[0]), 0, []
     for _ in range(5):
-        machine = Machine(data, _TENSOR_RULES, start=at)
+        machine = _PartMachine(data, _TENSOR_RULES, start=at)
         parts.append(run_machine(machine))
         at = machine.end
     reference = parts[3]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from typing import cast
 
 import numpy as np
@@ -11,6 +10,7 @@ from scipy.spatial.transform import Rotation
 from soma_core.io.joint_order import USER_JOINTS
 from soma_core.io.motion import Convention, Motion
 from soma_core.io.npz_fields import NpzFields, check_rotations
+from soma_core.json_file import parse_json
 from soma_core.topology.frames import METRES_PER_UNIT
 
 __all__ = ["METRES_PER_UNIT", "SCHEMA_VERSION", "read_soma_npz"]
@@ -206,7 +206,7 @@ def _rest(fields: NpzFields) -> dict[str, object]:
 def _parsed(fields: NpzFields, key: str) -> dict[str, object]:
     text = fields.text(key)
     try:
-        return dict(json.loads(text))
+        return dict(parse_json(text))
     except (ValueError, TypeError) as error:
         raise fields.refuse(
             key,

@@ -16,8 +16,8 @@ from soma_core.io.motion import Motion
 from soma_core.io.motion_files import check_rig, read_motion
 from soma_core.layer import SomaLayer
 from soma_core.options import FrameRange
-from soma_core.paths import assets_dir
 from soma_core.progress import progress
+from soma_core.rig.manifest import shipped_file
 
 if TYPE_CHECKING:
     from soma_core.animation.posed import Posed
@@ -62,7 +62,7 @@ def load_clip(
         SomaError: the file cannot be read.
         InputError: no frame is left.
     """
-    path = Path(path).expanduser() if path else assets_dir() / "motions/range_of_motion.npz"
+    path = Path(path).expanduser() if path else shipped_file("motions/range_of_motion.npz")
     motion, frames = read_motion(path, fps=fps), frames or FrameRange()
     part = slice(frames.start, frames.stop, frames.step)
     if part.step < 1 or not len(range(motion.frame_count)[part]):

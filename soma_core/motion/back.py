@@ -18,6 +18,7 @@ from soma_core.errors import InputError
 from soma_core.io.amass import SMPL_JOINTS
 from soma_core.io.motion import Motion
 from soma_core.io.motion_files import check_rig
+from soma_core.json_file import read_json
 from soma_core.layer import SomaLayer
 from soma_core.motion.animated import animate
 from soma_core.motion.chunks import FittedChunks
@@ -167,7 +168,7 @@ def _found_params(file: Path, target: SmplTarget, body: _MovingBody) -> dict[str
         _log.info("finding the body from %d frames", len(spread))
         found = target.fit.fit_params(body.posed(spread))
         atomic_text(file, json.dumps({name: value[0].tolist() for name, value in found.items()}))
-    return dict(json.loads(file.read_text(encoding="utf-8")))
+    return dict(read_json(file, fix="Delete it."))
 
 
 def _convert_missing(body: _MovingBody, target: NativeTarget, kept: FittedChunks) -> None:

@@ -13,6 +13,7 @@ import numpy as np
 
 from soma_core.cache import atomic_text, atomic_write
 from soma_core.errors import InputError
+from soma_core.json_file import read_json
 
 __all__ = ["FittedChunks", "refuse_other_settings"]
 
@@ -35,7 +36,7 @@ class FittedChunks:
         plan = json.loads(json.dumps({**settings, "chunk": size, "frames": frame_count}, default=str))
         file = folder / "settings.json"
         if file.is_file():
-            refuse_other_settings(folder, json.loads(file.read_text(encoding="utf-8")), plan)
+            refuse_other_settings(folder, read_json(file, fix=f"Delete {folder}."), plan)
             return
         for stale in folder.glob("*.npz"):  # nothing says what they were made from
             stale.unlink()

@@ -7,6 +7,7 @@ import logging
 import re
 import shutil
 import tempfile
+import traceback
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -165,15 +166,10 @@ def convert_folder(
     try:
         for number, file in enumerate(files, start=1):
             name = file.relative_to(folder.resolve()).as_posix()
-            if everyone and isinstance(convert, Converter) and (people := _several(file)):
-                for person, called in people.items():
-                    one = f"{name}/{called}"
-                    rows[one], told = _row(convert.of_person(person), file, out, one, found)
-                    _log.info("%d of %d: %s: %s", number, len(files), one, told)
-                continue
-            rows[name], told = _row(convert, file, out, name, found)
-            level = logging.WARNING if name in found.errors else logging.INFO
-            _log.log(level, "%d of %d: %s: %s", number, len(files), name, told)
+            for one, converter in _converters(convert, file, name, everyone=everyone):
+                rows[one], told = _row(converter, file, out, one, found)
+                level = logging.WARNING if one in found.errors else logging.INFO
+                _log.log(level, "%d of %d: %s: %s", number, len(files), one, told)
     finally:
         document = {"input": str(folder.resolve()), "files": rows}
         atomic_text(out / "report.json", json.dumps(document, indent=2) + "\n")
@@ -181,13 +177,17 @@ def convert_folder(
     return found
 
 
-def _several(file: Path) -> dict[str, str]:
-    """People of a file of several, and their names; none where it holds one or cannot be read."""
+def _converters(
+    convert: Converter | BackConverter, file: Path, name: str, *, everyone: bool
+) -> list[tuple[str, Converter | BackConverter]]:
+    """What to convert of a file of a folder: the file, or each of its people where all are asked for."""
     try:
-        people = _people(file)
+        people = _people(file) if everyone and isinstance(convert, Converter) else {}
     except SomaError:
-        return {}
-    return people if len(people) > 1 else {}
+        people = {}  # said when the file is converted
+    if len(people) < 2 or not isinstance(convert, Converter):
+        return [(name, convert)]
+    return [(f"{name}/{called}", convert.of_person(person)) for person, called in people.items()]
 
 
 def _converter(options: ConvertOptions) -> Converter | BackConverter:
@@ -202,6 +202,24 @@ def _files(folder: Path) -> Iterator[Path]:
             yield file
 
 
+def _unforeseen(file: Path, error: Exception) -> SomaError:
+    """What was not foreseen, as a sentence that names the file and the module where it happened."""
+    _log.debug("%s", file, exc_info=error)
+    module = next(
+        (
+            name
+            for frame, _ in reversed([*traceback.walk_tb(error.__traceback__)])
+            if (name := str(frame.f_globals.get("__name__"))).startswith("soma_core.")
+        ),
+        __name__,
+    )
+    told = " ".join(str(error).split())[:200] or "no text"
+    return SomaError(
+        f"{file}: {module} failed in a way that was not foreseen ({type(error).__name__}: {told}). "
+        "Leave the file out, and report it with the file."
+    )
+
+
 def _row(
     convert: Converter | BackConverter, file: Path, out: Path, name: str, found: FolderConverted
 ) -> tuple[Mapping[str, Any], str]:
@@ -211,9 +229,10 @@ def _row(
             found.skipped.append(name)
             return {"state": "skipped", "reason": "holds no motion"}, "holds no motion"
         converted = convert(file, ResultFiles.mirrored(out, name), out / "chunks" / name)
-    except SomaError as error:
-        found.errors[name] = error
-        return {"state": "failed", "reason": str(error)}, str(error)
+    except Exception as error:  # one file never ends a batch
+        refusal = error if isinstance(error, SomaError) else _unforeseen(file, error)
+        found.errors[name] = refusal
+        return {"state": "failed", "reason": str(refusal)}, str(refusal)
     found.converted[name] = converted
     report = converted.report
     row = {"state": "converted", "layout": report["settings"]["layout"], "frames": report["frames"],

@@ -10,9 +10,10 @@ from pathlib import Path
 from typing import Any
 
 from soma_core.cache import atomic_text
-from soma_core.errors import InputError, SomaError
+from soma_core.errors import AssetError, InputError, SomaError
 from soma_core.io.motion import Motion
 from soma_core.io.motion_files import read_motion
+from soma_core.json_file import read_json
 from soma_core.motion.bodies import FITTED, SMPL_SETTINGS, open_body
 from soma_core.motion.chunks import refuse_other_settings
 from soma_core.motion.files import Layout, ResultFiles, layout_of, read, write
@@ -244,7 +245,7 @@ def earlier_report(file: Path, result: Path, settings: Mapping[str, Any]) -> dic
     try:
         report = _read_report(file)
         before = dict(report["settings"])
-    except (ValueError, KeyError, TypeError):
+    except (AssetError, ValueError, KeyError, TypeError):
         return None  # no report of ours
     now = json.loads(json.dumps(settings, default=str))
     before.pop("found", None)
@@ -269,4 +270,4 @@ def _refuse_failed(path: Path, report: Mapping[str, Any], file: Path, *, axes_kn
 
 
 def _read_report(path: Path) -> dict[str, Any]:
-    return dict(json.loads(path.read_text(encoding="utf-8")))
+    return dict(read_json(path, fix="Delete it."))

@@ -86,7 +86,7 @@ class FitBackend:
         generator, layer = self._generator, self.layer
         if not isinstance(generator, HasSkinning):
             raise InputError(
-                "backend", got=f"{layer.backend}, without a skeleton of its own", expected="one that tells it",
+                "backend", got=f"{layer.backend}, without a skeleton", expected="one that has it",
                 fix="Pass the posed vertices to soma invert.",
             )  # fmt: skip
         given = batch_parameters(layer.spec, params, device=layer.device, dtype=layer.dtype)

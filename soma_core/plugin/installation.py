@@ -26,7 +26,10 @@ def local_source(distribution: str) -> tuple[str, bool] | None:
         document = json.loads(text or "null")
         url = urlsplit(document["url"])
         editable = bool(document.get("dir_info", {}).get("editable"))
-    except (importlib.metadata.PackageNotFoundError, ValueError, TypeError, KeyError, AttributeError):
+    except (
+        importlib.metadata.PackageNotFoundError, ValueError, TypeError, KeyError, AttributeError,
+        RecursionError,
+    ):  # fmt: skip
         return None
     return (url2pathname(url.path), editable) if url.scheme == "file" else None
 

@@ -11,6 +11,8 @@ from typing import Any
 from soma_core.cache import atomic_text, file_sha256
 from soma_core.errors import AssetError
 from soma_core.files import refuse_unreadable
+from soma_core.json_file import read_json
+from soma_core.paths import assets_dir
 
 __all__ = [
     "CORRECTIVES_NAME",
@@ -22,6 +24,7 @@ __all__ = [
     "Manifest",
     "check_files",
     "read_manifest",
+    "shipped_file",
     "verified_sha256",
     "write_manifest",
 ]
@@ -57,17 +60,15 @@ def read_manifest(root: Path) -> Manifest:
         AssetError: missing, not JSON, of another schema, or without a required key.
     """
     path = root / MANIFEST_NAME
-    refuse_unreadable(path, fix=RESTORE)
-    try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-    except (ValueError, RecursionError) as error:
-        raise AssetError(path, cause=f"not valid JSON ({error})", fix=RESTORE) from error
+    content = read_json(path, fix=RESTORE)
     schema = content.get("schema") if isinstance(content, dict) else None
     if schema != _SCHEMA:
         raise AssetError(path, cause=f"manifest schema is {schema}, expected {_SCHEMA}", fix=RESTORE)
     missing = [key for key in ("rig_hash", "rig_revision", "files") if key not in content]
     if missing:
         raise AssetError(path, cause=f"missing keys {missing}", fix=RESTORE)
+    if not isinstance(content["files"], dict):
+        raise AssetError(path, cause="files are no list of names", fix=RESTORE)
     return Manifest(
         rig_hash=content["rig_hash"], rig_revision=content["rig_revision"], files=content["files"]
     )
@@ -85,7 +86,22 @@ def write_manifest(root: Path, manifest: Manifest) -> None:
     atomic_text(root / MANIFEST_NAME, text)
 
 
-def verified_sha256(root: Path, manifest: Manifest, name: str) -> str:
+def shipped_file(name: str, *, fix: str = RESTORE) -> Path:
+    """Path of an asset, which is the one that was shipped where a manifest lists it.
+
+    Raises:
+        AssetError: it is listed and was changed, or the manifest itself is damaged.
+    """
+    root = assets_dir()
+    path = root / name
+    if path.is_file() and (root / MANIFEST_NAME).is_file():
+        manifest = read_manifest(root)
+        if name in manifest.files:
+            verified_sha256(root, manifest, name, fix=fix)
+    return path
+
+
+def verified_sha256(root: Path, manifest: Manifest, name: str, *, fix: str = RESTORE) -> str:
     """Check one asset against the manifest and return its SHA-256.
 
     Raises:
@@ -93,18 +109,20 @@ def verified_sha256(root: Path, manifest: Manifest, name: str) -> str:
     """
     path = root / name
     if name not in manifest.files:
-        raise AssetError(root / MANIFEST_NAME, cause=f"does not list {name}", fix=RESTORE)
-    refuse_unreadable(path, fix=RESTORE)
+        raise AssetError(root / MANIFEST_NAME, cause=f"does not list {name}", fix=fix)
+    refuse_unreadable(path, fix=fix)
     expected = manifest.files[name]
+    if not isinstance(expected, dict) or not {"size", "sha256"} <= {*expected}:
+        raise AssetError(root / MANIFEST_NAME, cause=f"{name} is without size or sha256", fix=fix)
     size = path.stat().st_size
     if size != expected["size"]:
         state = "truncated" if size < expected["size"] else "not the shipped one"
         cause = f"file is {state}: {size} bytes, expected {expected['size']}"
-        raise AssetError(path, cause=cause, fix=RESTORE)
+        raise AssetError(path, cause=cause, fix=fix)
     got = file_sha256(path)
     if got != expected["sha256"]:
         cause = f"SHA-256 is {got[:16]}..., expected {expected['sha256'][:16]}..."
-        raise AssetError(path, cause=cause, fix=RESTORE)
+        raise AssetError(path, cause=cause, fix=fix)
     return got
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -11,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from soma_core.errors import AssetError, InputError
+from soma_core.json_file import parse_json
 from soma_core.npz import open_npz_file
 from soma_core.paths import assets_dir
 from soma_core.rig.manifest import NEUTRAL_NAME, RESTORE, read_manifest, verified_sha256
@@ -132,7 +132,7 @@ def _read_metadata(path: Path, arrays: Mapping[str, np.ndarray]) -> dict[str, An
     if "metadata" not in arrays:
         return {}
     try:
-        metadata = json.loads(str(arrays["metadata"]))
+        metadata = parse_json(str(arrays["metadata"]))
     except ValueError as error:
         cause = f"metadata is not JSON ({error})"
         raise AssetError(path, cause=cause, fix="Write it again with the tool that made it") from error

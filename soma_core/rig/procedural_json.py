@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -10,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from soma_core.errors import AssetError
-from soma_core.files import refuse_unreadable
+from soma_core.json_file import read_json
 from soma_core.rig.manifest import RESTORE
 from soma_core.rig.procedural import MODES, ProceduralDefinition, TwistMode, TwistSegment
 
@@ -279,9 +278,4 @@ def read_procedural(path: Path | str) -> ProceduralDefinition:
         AssetError: unreadable file, or a field that is not as the schema says.
     """
     path = Path(path)
-    refuse_unreadable(path, fix=RESTORE)
-    try:
-        document = json.loads(path.read_text(encoding="utf-8"))
-    except (ValueError, RecursionError) as error:
-        raise AssetError(path, cause=f"not valid JSON ({error})", fix=RESTORE) from error
-    return parse_procedural(document, path)
+    return parse_procedural(read_json(path, fix=RESTORE), path)

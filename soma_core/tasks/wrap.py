@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import logging
 from collections.abc import Sequence
 from pathlib import Path
@@ -11,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 from omegaconf import OmegaConf
 
 from soma_core.errors import AssetError, InputError
+from soma_core.json_file import read_json
 from soma_core.options import BackendChoice
 from soma_core.plugin.registry import default_registry
 from soma_core.plugin.spec import WrapPair
@@ -113,13 +113,11 @@ def _json(name: str | None, kind: type, expected: str) -> Any:
     if name is None:
         return kind()
     path = Path(name).expanduser()
+    content = read_json(path, fix=f"Write {expected} as JSON.")
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
         items = [*content, *content.values()] if isinstance(content, dict) else content
         whole = isinstance(content, kind) and all(int(item) == float(item) for item in items)
-    except OSError as error:
-        raise AssetError(path, cause=f"cannot be read ({error.strerror})", fix="Correct the path.") from error
-    except (ValueError, TypeError):
+    except (ValueError, TypeError, OverflowError):
         whole = False
     if not whole:
         raise AssetError(path, cause=f"does not hold {expected}", fix="Write it as JSON.")

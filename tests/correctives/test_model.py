@@ -6,11 +6,13 @@ import numpy as np
 import pytest
 import torch
 
+from soma_core.cache import file_sha256
 from soma_core.correctives.model import Correctives, find_correctives, load_correctives
 from soma_core.correctives.weights import write_weights
 from soma_core.errors import AssetError
 from soma_core.geometry.rotations import axis_angle_to_matrix
 from soma_core.layer import SomaLayer
+from soma_core.rig.manifest import Manifest, write_manifest
 from soma_core.topology.lod_transfer import offset_rows
 from tests.bodies import CPU, randn, tiny_registry
 from tests.correctives.test_weights import made_weights
@@ -129,6 +131,22 @@ def test_auto_is_for_the_shipped_rig_alone(body, tmp_path, monkeypatch, checkpoi
     assert find_correctives("auto", shipped=False) is None
     monkeypatch.setenv("SOMA_ASSETS", str(tmp_path))
     assert find_correctives("auto", shipped=True) is None
+
+
+def test_the_shipped_file_is_compared_with_its_hash(body, tmp_path, monkeypatch, checkpoint):
+    shipped, entry = tmp_path / "correctives_model.pt", {"size": checkpoint.stat().st_size}
+    shipped.write_bytes(checkpoint.read_bytes())
+    entry["sha256"] = file_sha256(shipped)
+    files = {shipped.name: entry}
+    write_manifest(tmp_path, Manifest(rig_hash="a", rig_revision="b", files=files))
+    monkeypatch.setenv("SOMA_ASSETS", str(tmp_path))
+    assert find_correctives("auto", shipped=True) == shipped
+    changed = bytearray(shipped.read_bytes())
+    changed[len(changed) // 2] ^= 1
+    shipped.write_bytes(changed)
+    with pytest.raises(AssetError, match=r"correctives_model\.pt: SHA-256 is .*correctives=FILE"):
+        find_correctives("auto", shipped=True)
+    assert find_correctives(shipped, shipped=True) == shipped  # named by the user, who may have made it
 
 
 def test_a_named_file_must_be_there_and_fit(body, weights, tmp_path, checkpoint):

@@ -122,7 +122,7 @@ def test_code_in_a_file_is_not_run(tmp_path, capsys):
     torch.save({"C_max": _Harm()}, tmp_path / "harm.pt")
     (tmp_path / "raw.pt").write_bytes(pickle.dumps(_Harm(), protocol=2))
     for name in ("harm.pt", "raw.pt"):
-        with pytest.raises(AssetError, match="not a checkpoint of plain tensors"):
+        with pytest.raises(AssetError, match="asks for __builtin__.print|not a file of tensors"):
             read_weights(tmp_path / name)
     assert "executed" not in capsys.readouterr().out
 

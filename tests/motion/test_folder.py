@@ -99,3 +99,21 @@ def test_twist_and_correctives_are_options_of_a_conversion(smplh_models, amass_f
     assert (settings["procedural"], settings["correctives"]) == (False, None)
     with pytest.raises(InputError, match=r"procedural \(and correctives\): got True, expected False"):
         conversion.convert_file(amass_file, tmp_path / "out", options=ConvertOptions(lod="low"))
+
+
+@pytest.mark.parametrize("kind", [RecursionError, MemoryError, KeyError, ZeroDivisionError])
+def test_what_nobody_foresaw_is_one_failed_row(tmp_path, monkeypatch, kind):
+    for name in "ab":
+        write_motion(motion(), tmp_path / f"{name}.npz")
+    read = conversion.layout_of
+
+    def failing(file):
+        if file.name == "a.npz":
+            raise kind("deep in a reader")
+        return read(file)
+
+    monkeypatch.setattr(conversion, "layout_of", failing)
+    found = convert_folder(tmp_path, tmp_path / "out")
+    assert list(found.converted) == ["b.npz"]
+    told = str(found.errors["a.npz"])
+    assert re.search(rf"a\.npz: soma_core\.[\w.]+ failed .*{kind.__name__}: .*deep in a reader", told)
