@@ -45,7 +45,7 @@ _CONTAINERS = frozenset(
 )
 """Names on the way to a body that tell nothing about whose it is."""
 
-_DEEPEST, _MOST_NODES = 6, 200_000
+_DEEPEST, _MOST_NODES, _MOST_SEEN = 6, 50_000, 1_000_000
 _LONGEST_LIST = 64
 """People in a list; longer lists are frames or something else."""
 
@@ -155,7 +155,7 @@ class _Walk:
     def _of_list(self, node: Sequence[Any], way: tuple[str, ...], above: Mapping[str, Any]) -> Iterator[Any]:
         if not node or not all(isinstance(item, dict) for item in node):
             return
-        if len(node) > 1 and self._is_frame(node[0]):
+        if len(node) > 1 and len(node) * len(node[0]) < _MOST_SEEN and self._is_frame(node[0]):
             common = [key for key in node[0] if all(key in item for item in node)]
             yield from self.bodies({key: [item[key] for item in node] for key in common}, way, above)
         elif len(node) <= _LONGEST_LIST:
@@ -261,7 +261,7 @@ def _tracks(node: Mapping[Any, Any]) -> dict[str, dict[str, tuple[str, Any]]]:
     frames = [
         frame for frame in node.values() if isinstance(frame, dict) and isinstance(frame.get("smpl"), list)
     ]
-    if not frames or len(frames) < len(node):
+    if not frames or len(frames) < len(node) or sum(len(frame["smpl"]) for frame in frames) > _MOST_SEEN:
         return {}
     seen: dict[str, dict[str, list[Any]]] = {}
     for number, frame in enumerate(frames):

@@ -96,7 +96,7 @@ def test_files_of_one_name_and_two_suffixes_stay_apart(tmp_path):
 @pytest.mark.parametrize(
     ("content", "said"),
     [
-        ({}, "got no file ending in .npz or .parquet, expected motion files"),
+        ({}, "got no file ending in .npz or .npy or .pkl .*, expected motion files"),
         ({"a.npz": {"betas": 1}}, "got 1 files without a motion"),
         ({"a.npz": {"poses": 1, "trans": 1}}, r"a\.npz: poses: got shape \(\)"),
     ],
