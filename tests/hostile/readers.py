@@ -25,8 +25,8 @@ from soma_core.rig.manifest import MANIFEST_NAME, read_manifest
 from soma_core.rig.neutral import load_shape_space, read_topology
 from soma_core.rig.procedural_json import read_procedural
 from soma_core.rig.usd import read_usd_rig
-from tests.io.smpl_layouts import save_joblib, save_npy, save_npz, save_pt, smplx_names, wham
 from tests.io.smpl_layouts import TURNS as SMPLX_TURNS
+from tests.io.smpl_layouts import save_joblib, save_npy, save_npz, save_pt, smplx_names, wham
 from tests.standins.pickles import ch, csc, select, write_pickle
 
 __all__ = ["READERS", "Reader"]
