@@ -134,6 +134,8 @@ TOOLS = (
     Tool(name="MDM", keys=("thetas", "root_translation"), fps=20, up="+y", gender="neutral", no_betas=True),
     Tool(name="Motion-X", keys=("motion_x_322",), fps=30, up="+y", gender="neutral"),
     Tool(name="Inter-X", keys=("pose_lhand", "pose_rhand")),
+    Tool(name="TRACE", keys=("smpl_thetas", "world_trans"), fps=30, gender="neutral"),
+    Tool(name="ROMP", keys=("smpl_thetas", "cam_trans"), fps=30, gender="neutral", space="camera"),
     Tool(name="SLAHMR", keys=("root_orient", "pose_body", "cam_R"), fps=30, gender="neutral"),
     Tool(name="the smplx library", keys=("global_orient", "body_pose"), gender="neutral"),
 )
