@@ -1,4 +1,4 @@
-"""What a model is posed with: fingers from flat hands, the root about the pelvis; and all people of a file."""
+"""What a model is posed with: fingers, the root about the pelvis; and all people of a file."""
 
 from __future__ import annotations
 
