@@ -22,13 +22,14 @@ if TYPE_CHECKING:
     from soma_core.inversion.identity import IdentityFit, fit_identity
     from soma_core.inversion.priors import HINGES, PosePriors
     from soma_core.inversion.result import InversionResult
-    from soma_core.io.amass import SmplMotion, read_amass, write_amass
+    from soma_core.io.amass import SmplMotion, write_amass
     from soma_core.io.clip import SkinnedClip, skinned_clip
     from soma_core.io.gltf import write_gltf
     from soma_core.io.joint_order import USER_JOINTS
     from soma_core.io.motion import Motion
     from soma_core.io.motion_files import read_motion, write_motion
     from soma_core.io.sam3d import Sam3dFrames, read_sam3d
+    from soma_core.io.smpl_files import SmplChoices, read_amass, read_smpl
     from soma_core.io.usd import write_usd
     from soma_core.io.vertex_files import open_vertex_sequence
     from soma_core.io.vertex_sequence import VertexSequence
@@ -70,6 +71,7 @@ __all__ = [
     "Sam3dFrames",
     "ShapeSpace",
     "SkinnedClip",
+    "SmplChoices",
     "SmplMotion",
     "SomaError",
     "SomaLayer",
@@ -85,6 +87,7 @@ __all__ = [
     "read_amass",
     "read_motion",
     "read_sam3d",
+    "read_smpl",
     "skinned_clip",
     "write_amass",
     "write_gltf",
@@ -120,7 +123,8 @@ _HOMES = {
     "soma_core.io.motion": ["Motion"],
     "soma_core.io.joint_order": ["USER_JOINTS"],
     "soma_core.io.motion_files": ["read_motion", "write_motion"],
-    "soma_core.io.amass": ["SmplMotion", "read_amass", "write_amass"],
+    "soma_core.io.amass": ["SmplMotion", "write_amass"],
+    "soma_core.io.smpl_files": ["SmplChoices", "read_amass", "read_smpl"],
     "soma_core.io.sam3d": ["Sam3dFrames", "read_sam3d"],
     # Moving meshes, and scenes that other programs open
     "soma_core.io.vertex_sequence": ["VertexSequence"],

@@ -37,13 +37,18 @@ class ArrayHeader:
     begin: int
 
     @property
+    def count(self) -> int:
+        """How many numbers."""
+        return math.prod(self.shape)
+
+    @property
     def byte_count(self) -> int:
         """Bytes of its numbers."""
-        return math.prod(self.shape) * self.dtype.itemsize
+        return self.count * self.dtype.itemsize
 
 
-def read_array_header(stream: IO[bytes]) -> ArrayHeader:
-    """Read the header of an NPY stream.
+def read_array_header(stream: IO[bytes], *, objects: bool = False) -> ArrayHeader:
+    """Read the header of an NPY stream, of one that a pickle of `objects` follows only if that is asked for.
 
     Raises:
         ValueError: it is none, or describes objects or a shape that cannot be.
@@ -61,7 +66,7 @@ def read_array_header(stream: IO[bytes]) -> ArrayHeader:
         shape, fortran, dtype = readers[version](io.BytesIO(size + stream.read(length)))
     except (*_DAMAGE, tokenize.TokenError) as error:
         raise ValueError(f"{error or type(error).__name__}"[:200]) from error
-    if dtype.hasobject:
+    if dtype.hasobject and not objects:
         raise ValueError("Python objects, which can run code")
     if any(size < 0 for size in shape):
         raise ValueError(f"the shape {shape}")
@@ -82,14 +87,14 @@ class NpzFile:
         """Keys in the order they were stored."""
         return tuple(self._members)
 
-    def header(self, name: str) -> ArrayHeader:
+    def header(self, name: str, *, objects: bool = False) -> ArrayHeader:
         """Layout of the array under `name`; its numbers stay unread.
 
         Raises:
-            ValueError: damaged, or Python objects; the text says which.
+            ValueError: damaged, or Python objects where they are not asked for; the text says which.
         """
         with self._open(name) as stream:
-            return read_array_header(stream)
+            return read_array_header(stream, objects=objects)
 
     def read(self, name: str) -> np.ndarray:
         """Array under `name`.
@@ -114,6 +119,20 @@ class NpzFile:
         if len(data) != header.byte_count:
             raise ValueError(f"{len(data)} bytes for the shape {header.shape} of {header.dtype}")
         return np.ndarray(header.shape, header.dtype, data, order="F" if header.fortran else "C")
+
+    def pickled(self, name: str) -> bytes:
+        """The pickle that an array of Python objects under `name` is, which nothing here runs.
+
+        Raises:
+            ValueError: damaged, no such array, or larger than the file can mean.
+        """
+        with self._open(name) as stream:
+            if not read_array_header(stream, objects=True).dtype.hasobject:
+                raise ValueError("an array of no objects")
+            data = stream.read(self._most + 1)
+        if len(data) > self._most:
+            raise ValueError(f"more than {self._most} bytes of Python objects")
+        return data
 
     @contextmanager
     def _open(self, name: str) -> Iterator[IO[bytes]]:

@@ -18,6 +18,7 @@ __all__ = [
     "AnalyticalChoice",
     "AutogradChoice",
     "BackendChoice",
+    "BetasFrom",
     "BodyGender",
     "BvhChoice",
     "BvhRest",
@@ -25,10 +26,12 @@ __all__ = [
     "BoneMatch",
     "Carry",
     "ConvertResult",
+    "Coordinates",
     "EulerOrder",
     "FitLod",
     "FrameRange",
     "Gallery",
+    "Gaps",
     "Ground",
     "IdentityChoice",
     "IdentityMethod",
@@ -42,11 +45,21 @@ __all__ = [
     "Picture",
     "PriorChoice",
     "Product",
+    "RotationLayout",
     "SmplLayout",
+    "SmplModel",
     "Topology",
     "Translation",
     "Upward",
 ]
+
+
+class BetasFrom(StrEnum):
+    """How one body is made of shapes for each frame."""
+
+    mean = "mean"
+    median = "median"
+    first = "first"
 
 
 class BodyGender(StrEnum):
@@ -92,6 +105,13 @@ class ConvertResult(StrEnum):
     vertices = "vertices"
 
 
+class Coordinates(StrEnum):
+    """Which of a file's motions of one person is taken."""
+
+    world = "world"
+    camera = "camera"
+
+
 class FitLod(StrEnum):
     """Level of detail that poses are fitted on."""
 
@@ -112,6 +132,13 @@ class Ground(StrEnum):
     contacts = "contacts"
     lowest = "lowest"
     none = "none"
+
+
+class Gaps(StrEnum):
+    """What becomes of frames that a file lacks."""
+
+    interpolate = "interpolate"
+    drop = "drop"
 
 
 class IdentityMethod(StrEnum):
@@ -171,6 +198,23 @@ class Product(StrEnum):
     pc2 = "pc2"
     mdd = "mdd"
     usdpoints = "usdpoints"
+
+
+class RotationLayout(StrEnum):
+    """Order of quaternions; whether 6D rotations are the first two rows or columns of a matrix."""
+
+    wxyz = "wxyz"
+    xyzw = "xyzw"
+    rows = "rows"
+    columns = "columns"
+
+
+class SmplModel(StrEnum):
+    """Models of the SMPL family."""
+
+    smpl = "smpl"
+    smplh = "smplh"
+    smplx = "smplx"
 
 
 class Topology(StrEnum):

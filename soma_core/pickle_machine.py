@@ -16,7 +16,9 @@ import warnings
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
-__all__ = ["STORED", "Global", "Machine", "PickleRules", "Record", "RefusedPickleError", "run_pickle"]
+__all__ = [
+    "STORED", "Global", "Machine", "PickleRules", "Record", "RefusedPickleError", "run_machine", "run_pickle",
+]  # fmt: skip
 
 _LONG_TEXT = 1024
 """Bytes from which on a string is left in the file until it is asked for."""
@@ -80,8 +82,17 @@ def run_pickle(data: mmap.mmap | bytes, rules: PickleRules) -> Any:
     Raises:
         RefusedPickleError: damaged, or with names, keys or instructions beyond the rules.
     """
+    return run_machine(Machine(data, rules))
+
+
+def run_machine(machine: Machine) -> Any:
+    """The same of a machine that is more than this one.
+
+    Raises:
+        RefusedPickleError: as :func:`run_pickle`.
+    """
     try:
-        return Machine(data, rules).run()
+        return machine.run()
     except RefusedPickleError:
         raise
     except (IndexError, KeyError, TypeError, ValueError, struct.error, OverflowError, MemoryError) as error:
@@ -381,6 +392,6 @@ _STEPS: dict[int, Callable[[Machine], object]] = {
         "g": lambda m: m.get(m.line_number()), "h": lambda m: m.get(m.number("<B")),
         "j": lambda m: m.get(m.number("<I")),
         "c": Machine.line_name, "\x93": Machine.stack_name,
-        "R": Machine.call, "\x81": Machine.call, "b": Machine.build, "Q": Machine.stored,
+        "R": Machine.call, "\x81": Machine.call, "b": lambda m: m.build(), "Q": Machine.stored,
     }.items()
 }  # fmt: skip

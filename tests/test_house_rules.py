@@ -87,17 +87,19 @@ PUBLIC_NAMES = {
         AnalyticalOptions AssetError AutogradOptions BackendError CanonicalMesh HINGES Identity IdentityFit
         InputError InversionResult Motion NativeFit NativeMotion NativeTransfer ParameterFit PoseInversion
         PosePriors
-        Posed Rig Sam3dFrames ShapeSpace SkinnedClip SmplMotion SomaError SomaLayer USER_JOINTS
+        Posed Rig Sam3dFrames ShapeSpace SkinnedClip SmplChoices SmplMotion SomaError SomaLayer USER_JOINTS
         VertexSequence __version__ assets_dir default_registry diagnose_fit fit_identity load_canonical
         load_shape_space
-        open_vertex_sequence read_amass read_motion read_sam3d skinned_clip write_amass write_gltf
+        open_vertex_sequence read_amass read_motion read_sam3d read_smpl skinned_clip write_amass write_gltf
         write_motion write_usd
     """,
     "soma_core.motion": """
         Animated BackendChoice ConvertOptions Converted FitOptions FitPlan FolderConverted FrameRange
         IdentityChoice
         InversionChoice InvertOptions Picture Played WriteOptions animate convert convert_file convert_folder
-        finish_fit fit_chunks invert layout_of load_clip plan_fit read stored_identity write write_products
+        convert_people
+        finish_fit fit_chunks invert layout_of load_clip plan_fit read stored_identity write write_body
+        write_products
     """,
     "soma_core.plugin": """
         API_VERSION Axis BackendSpec BrokenBackendError Check CheckFailedError ClosestFaces FileNeeded

@@ -43,7 +43,6 @@ def test_options_are_set_once_and_travel():
     ("changes", "said"),
     [
         ({"chunk": 0}, "chunk: got 0, expected at least 1"),
-        ({"betas": [1.0]}, "betas: got .* expected none with to=soma"),
         ({"to": "smplh", "most_betas": 1}, "most_betas: got 1, expected none with to=smplh"),
     ],
 )

@@ -5,21 +5,18 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal, cast, get_args
+from typing import Literal, get_args
 
 import numpy as np
 
 from soma_core.cache import atomic_arrays
 from soma_core.errors import InputError
-from soma_core.io.npz_fields import NpzFields, open_npz
 
 __all__ = [
     "SMPL_JOINTS",
     "Gender",
     "SmplMotion",
     "SmplName",
-    "holds_smpl_motion",
-    "read_amass",
     "write_amass",
     "write_smplx",
 ]
@@ -43,7 +40,6 @@ _SMPLX_PARTS: dict[SmplName, dict[str, int]] = {
 
 _EXPRESSIONS = 10
 
-_RATES = ("mocap_framerate", "mocap_frame_rate", "fps")
 _SECONDS = "mocap_time_length"
 
 
@@ -60,7 +56,10 @@ class SmplMotion:
         betas: (k,) shape coefficients.
         gender: of the model that the shape belongs to.
         fps: frames per second.
-        up: upward axis of the world: ``+z`` in AMASS.
+        up: upward axis of the world: ``+z`` in AMASS, ``-y`` in a camera.
+        about: what the root rotation turns about, before the translation: the pelvis, or the origin of the
+            model as EasyMocap has it.
+        flat_hands: whether zero is a flat hand; False: the model's mean hand.
         source: where it came from.
 
     Raises:
@@ -73,7 +72,9 @@ class SmplMotion:
     betas: np.ndarray
     gender: Gender
     fps: float
-    up: Literal["+y", "+z"] = "+z"
+    up: Literal["+y", "+z", "-y", "-z"] = "+z"
+    about: Literal["pelvis", "origin"] = "pelvis"
+    flat_hands: bool = True
     source: str = ""
 
     def __post_init__(self) -> None:
@@ -83,7 +84,8 @@ class SmplMotion:
         for name, value, among in (
             ("model", self.model, get_args(SmplName)),
             ("gender", self.gender, get_args(Gender)),
-            ("up", self.up, ("+y", "+z")),
+            ("up", self.up, ("+y", "+z", "-y", "-z")),
+            ("about", self.about, ("pelvis", "origin")),
         ):
             if value not in among:
                 expected = "one of " + ", ".join(map(repr, among))
@@ -107,109 +109,6 @@ def _expect(argument: str, array: np.ndarray, shape: tuple[int, ...]) -> None:
         raise InputError(
             argument, got=got, expected=f"finite numbers of shape {shape}", fix="Give one row a frame."
         )
-
-
-def holds_smpl_motion(fields: NpzFields) -> bool:
-    """Tell whether the keys of a file are those of a motion of the SMPL family."""
-    return "trans" in fields and ("poses" in fields or "pose_body" in fields)
-
-
-def read_amass(
-    path: str | Path,
-    *,
-    fps: float | None = None,
-    gender: Gender | None = None,
-    up: Literal["+y", "+z"] | None = None,
-) -> SmplMotion:
-    """Read an ``.npz`` of AMASS: SMPL-H (``poses`` of 156 values), SMPL-X (parts, or 165), also SMPL (72).
-
-    Soft-tissue coefficients (``dmpls``) and markers are not read.
-
-    Args:
-        path: the file. Nothing in it is executed; keys that are not needed are ignored.
-        fps: frame rate; overrides the file's own.
-        gender: of the body; overrides the file's own.
-        up: upward axis of the world; ``+z`` unless told otherwise, the files do not say.
-
-    Raises:
-        AssetError: the file is missing, damaged, a git-LFS pointer or no NPZ.
-        InputError: a key is missing or holds what a motion cannot have.
-    """
-    with open_npz(path) as fields:
-        poses = _poses(fields)
-        model = next(name for name, count in SMPL_JOINTS.items() if 3 * count == poses.shape[1])
-        return SmplMotion(
-            model=model,
-            rotations=poses.reshape(len(poses), -1, 3),
-            translation=fields.numbers("trans", (len(poses), 3)),
-            betas=_betas(fields, len(poses)),
-            gender=gender or _gender(fields),
-            fps=_rate(fields) if fps is None else float(fps),
-            up=up or "+z",
-            source=fields.path.name,
-        )
-
-
-def _poses(fields: NpzFields) -> np.ndarray:
-    """Axis-angle values of all joints, (frames, 72, 156 or 165)."""
-    if "pose_body" in fields:
-        rows = fields.numbers("pose_body", ("frames", _PARTS["pose_body"]))
-        parts = [fields.numbers(key, (len(rows), width)) for key, width in _PARTS.items()]
-        poses = np.concatenate(parts, axis=1)
-    else:
-        poses = fields.numbers("poses", ("frames", "72, 156 or 165"))
-    widths = {3 * count: name for name, count in SMPL_JOINTS.items()}
-    if poses.shape[1] not in widths or not len(poses):
-        raise fields.refuse(
-            "poses",
-            got=f"shape {poses.shape}",
-            expected=", ".join(f"{width} values ({name})" for width, name in widths.items()) + " a frame",
-            fix="Export all joints as axis-angle vectors, hands included.",
-        )
-    return poses
-
-
-def _betas(fields: NpzFields, frames: int) -> np.ndarray:
-    """One row of coefficients; files that repeat it for every frame are accepted."""
-    single = fields.raw("betas").ndim == 1
-    rows = np.atleast_2d(fields.numbers("betas", ("k",) if single else ("1 or frames", "k")))
-    if len(rows) not in (1, frames) or np.ptp(rows, axis=0).max(initial=0) > 0:
-        raise fields.refuse(
-            "betas",
-            got=f"{len(rows)} rows" + (" that differ" if len(rows) == frames else ""),
-            expected="one row of shape coefficients",
-            fix="Write one file a body.",
-        )
-    return rows[0]
-
-
-def _gender(fields: NpzFields) -> Gender:
-    name = fields.text("gender").lower()
-    if name not in get_args(Gender):
-        raise fields.refuse(
-            "gender",
-            got=repr(name),
-            expected=" or ".join(map(repr, get_args(Gender))),
-            fix="Pass gender=neutral, male or female.",
-        )
-    return cast("Gender", name)
-
-
-def _rate(fields: NpzFields) -> float:
-    key = next((key for key in _RATES if key in fields), None)
-    if key is None:
-        raise fields.refuse(
-            _RATES[0],
-            got="no frame rate",
-            expected="frames per second",
-            fix="Pass fps=120 (or the true rate).",
-        )
-    rate = fields.number(key)
-    if rate <= 0:
-        raise fields.refuse(
-            key, got=f"{rate:g}", expected="a positive number", fix="Pass fps=120 (the true rate)."
-        )
-    return rate
 
 
 def write_amass(

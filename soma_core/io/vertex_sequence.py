@@ -12,7 +12,7 @@ from soma_core.errors import AssetError, InputError
 
 __all__ = ["UpAxis", "VertexSequence", "even_rate"]
 
-UpAxis = Literal["+y", "+z"]
+UpAxis = Literal["+y", "+z", "-y", "-z"]
 
 _SPACING_TOLERANCE = 1e-2
 """Largest departure of a time step from the others, relative: times are stored in float32."""

@@ -11,7 +11,13 @@ from soma_core._lazy import lazy_names
 
 if TYPE_CHECKING:
     from soma_core.motion.animated import Animated, animate, load_clip
-    from soma_core.motion.conversion import FolderConverted, convert, convert_file, convert_folder
+    from soma_core.motion.conversion import (
+        FolderConverted,
+        convert,
+        convert_file,
+        convert_folder,
+        convert_people,
+    )
     from soma_core.motion.converter import Converted, finish_fit, invert, plan_fit
     from soma_core.motion.files import layout_of, read, write
     from soma_core.motion.fit_job import FitPlan, fit_chunks
@@ -41,6 +47,7 @@ __all__ = [
     "convert",
     "convert_file",
     "convert_folder",
+    "convert_people",
     "finish_fit",
     "fit_chunks",
     "invert",
@@ -56,7 +63,13 @@ __all__ = [
 
 _HOMES = {
     "soma_core.motion.animated": ["Animated", "animate", "load_clip"],
-    "soma_core.motion.conversion": ["FolderConverted", "convert", "convert_file", "convert_folder"],
+    "soma_core.motion.conversion": [
+        "FolderConverted",
+        "convert",
+        "convert_file",
+        "convert_folder",
+        "convert_people",
+    ],
     "soma_core.motion.converter": ["Converted", "finish_fit", "invert", "plan_fit"],
     "soma_core.motion.files": ["layout_of", "read", "write"],
     "soma_core.motion.fit_job": ["FitPlan", "fit_chunks"],

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
+from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -12,8 +13,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from soma_core.errors import AssetError, InputError
-from soma_core.io.amass import SmplMotion, read_amass
+from soma_core.io.amass import SmplMotion
 from soma_core.io.sam3d import Sam3dFrames, read_sam3d
+from soma_core.io.smpl_files import SmplChoices, read_smpl
 from soma_core.io.vertex_files import open_vertex_sequence
 from soma_core.motion.models import (
     FitBackend,
@@ -30,9 +32,18 @@ from soma_core.plugin.registry import default_registry
 if TYPE_CHECKING:
     from soma_core.plugin.spec import BackendSpec
 
-__all__ = ["FITTED", "ShownBody", "open_body"]
+__all__ = ["FITTED", "SMPL_LAYOUTS", "SMPL_SETTINGS", "ShownBody", "open_body"]
 
 _log = logging.getLogger(__name__)
+
+SMPL_LAYOUTS = ("amass", "smpl")
+"""Layouts whose bodies are of the SMPL family."""
+
+SMPL_SETTINGS = (
+    "gender", "betas", "betas_from", "model", "person", "coordinates", "rotation_layout", "flat_hand_mean",
+    "gaps", "longest_gap",
+)  # fmt: skip
+"""Options that only these layouts heed."""
 
 _UPRIGHT = 0.7
 """Cosine between the mean upward direction of a body and that of its world, where people mostly stand."""
@@ -117,32 +128,74 @@ def _search(options: FitOptions) -> dict[str, Any]:
 
 
 def _smpl_body(path: Path, options: ConvertOptions, backends: FitBackends) -> ShownBody:
-    """The body of an AMASS file: its model, posed with its betas and gender.
+    """The body of an SMPL motion: its model, posed with its betas and gender.
 
     Raises:
         SomaError: the file cannot be read, or the user's model of that gender is not there.
     """
-    motion = read_amass(
-        path,
-        fps=options.fps,
-        gender=str(options.gender) if options.gender else None,
-        up=f"+{options.up}" if options.up else None,
-    )
+    motion = read_smpl(path, smpl_choices(options))
     _warn_lying(path, motion)
     backend = _with_way_out(
         backends, motion.model, {"gender": motion.gender}, "carry=skeleton, which needs no model"
     )
     params = {"betas": _usable_betas(path, motion, backend.layer.spec, options.most_betas)}
-    pose = {"rotations": motion.rotations, "translation": motion.translation}
+    pose = _model_pose(path, motion, backend, params)
     sequence = ModelSequence(path, backend, params, pose, fps=motion.fps, up=motion.up)
     return ShownBody(
         backend=backend,
         posed=PosedInput(sequence, backend.layer, topology="native"),
         params=params,
         search={},
-        facts={"up": motion.up},
+        facts={"up": motion.up, **_reading(options)},
         licence=f"that of {path.name}; body model: {backend.layer.spec.licence}",
     )
+
+
+def smpl_choices(options: ConvertOptions) -> SmplChoices:
+    """How a file of the SMPL family is read; ``person=all`` of a file of one is that one."""
+    given = {
+        name: str(value) if isinstance(value, StrEnum) else value
+        for name in SMPL_SETTINGS
+        if (value := getattr(options, name)) is not None
+    }
+    if given.get("person") == "all":
+        del given["person"]
+    return SmplChoices(**given | ({"up": f"+{options.up}"} if options.up else {}), fps=options.fps)
+
+
+def _reading(options: ConvertOptions) -> dict[str, Any]:
+    """Settings of the reading that are not those of every file, for the report."""
+    plain = SmplChoices()
+    read = vars(smpl_choices(options))
+    return {
+        name: read[name] for name in SMPL_SETTINGS if name != "gender" and read[name] != getattr(plain, name)
+    }
+
+
+def _model_pose(
+    path: Path, motion: SmplMotion, backend: FitBackend, params: Mapping[str, Any]
+) -> dict[str, np.ndarray]:
+    """The pose as the model takes it: fingers from flat hands, the root turning about the pelvis.
+
+    Raises:
+        InputError: the user's model file does not hold its mean hands.
+    """
+    rotations, translation = motion.rotations, motion.translation
+    if not motion.flat_hands and motion.model != "smpl":
+        mean = backend.mean_hands
+        if mean is None:
+            raise InputError(
+                f"{path}: flat_hand_mean",
+                got=f"false, and a {motion.model} model without hands_meanl, hands_meanr",
+                expected="the official model file, which holds the mean hands",
+                fix=f"Run: soma backends convert {motion.model} FILE. Or pass flat_hand_mean=true.",
+            )  # fmt: skip
+        rotations = rotations.copy()
+        rotations[:, -30:] += mean
+    if motion.about == "origin":
+        pelvis = backend.rest_joints(params)[0]
+        translation = translation + Rotation.from_rotvec(rotations[:, 0]).apply(pelvis) - pelvis
+    return {"rotations": rotations, "translation": translation.astype(np.float32)}
 
 
 def _usable_betas(path: Path, motion: SmplMotion, spec: BackendSpec, most: int | None) -> list[float]:
@@ -167,7 +220,7 @@ def _usable_betas(path: Path, motion: SmplMotion, spec: BackendSpec, most: int |
 def _warn_lying(path: Path, motion: SmplMotion) -> None:
     """Say so where people stand along another axis than the file's world is taken to have."""
     upward = Rotation.from_rotvec(motion.rotations[:, 0]).apply([0, 1, 0]).mean(axis=0)
-    other = {"+z": "+y", "+y": "+z"}[motion.up]
+    other = {"z": "+y", "y": "+z"}[motion.up[1]]
     if upward["xyz".index(other[1])] > _UPRIGHT:
         _log.warning(
             "%s: the body stands along %s, but the world is taken to have %s up; if not so, pass up=%s",
@@ -273,6 +326,6 @@ def _mhr_params(frames: Sam3dFrames) -> dict[str, list[float]]:
 
 
 FITTED: dict[str, Callable[[Path, Any, FitBackends], ShownBody]] = {
-    "vertices": _vertex_body, "amass": _smpl_body, "sam3d": _sam3d_body,
+    "vertices": _vertex_body, "amass": _smpl_body, "smpl": _smpl_body, "sam3d": _sam3d_body,
 }  # fmt: skip
 """Layouts whose bodies are fitted, and their readers."""

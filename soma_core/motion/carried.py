@@ -3,23 +3,26 @@
 from __future__ import annotations
 
 import logging
+from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
-
 from soma_core.errors import InputError
-from soma_core.io.amass import read_amass
 from soma_core.io.joint_names import read_mapping
 from soma_core.io.skeleton_files import read_skeleton
+from soma_core.io.smpl_files import read_smpl
 from soma_core.io.smpl_skeleton import smpl_skeleton
+from soma_core.motion.bodies import smpl_choices
 from soma_core.motion.options import ConvertOptions
 from soma_core.motion.retarget import Retargeted, retarget
 from soma_core.options import BoneMatch
 from soma_core.rig import load_canonical
 
-__all__ = ["carried", "check_carried"]
+__all__ = ["SMPL_LAYOUTS", "carried", "check_carried"]
 
 _log = logging.getLogger(__name__)
+
+SMPL_LAYOUTS = ("amass", "smpl")
+"""Layouts of the SMPL family."""
 
 _SHOWN = 12
 
@@ -31,9 +34,9 @@ def check_carried(path: Path, layout: str, options: ConvertOptions) -> None:
         InputError: a setting that would change nothing.
     """
     skeleton = layout == "skeleton"
-    joints = skeleton or (layout == "amass" and options.carry == "skeleton")
+    joints = skeleton or (layout in SMPL_LAYOUTS and options.carry == "skeleton")
     unused = {
-        "carry": options.carry if options.carry != "fit" and layout != "amass" else None,
+        "carry": options.carry if options.carry != "fit" and layout not in SMPL_LAYOUTS else None,
         "mapping": None if skeleton else options.mapping, "root": None if skeleton else options.root,
         "match": None if joints else options.match,
         "gender": options.gender if skeleton else None, "most_betas": options.most_betas if joints else None,
@@ -51,10 +54,9 @@ def carried(path: Path, layout: str, options: ConvertOptions) -> Retargeted:
         SomaError: the file cannot be read, or its joints are not known.
     """
     up, match = str(options.up) if options.up else None, options.match
-    if layout == "amass":
-        motion = read_amass(path, fps=options.fps, gender="neutral", up=f"+{up}" if up else None)  # type: ignore[arg-type]
-        if np.any(motion.betas):
-            _log.warning("%s: betas are not read: joints are carried over, no body is fitted", path.name)
+    if layout in SMPL_LAYOUTS:
+        motion = read_smpl(path, replace(smpl_choices(options), gender="neutral", betas=(0.0,) * 10))
+        _log.warning("%s: betas are not read: joints are carried over, no body is fitted", path.name)
         source, up, match = smpl_skeleton(motion, load_canonical("mid")[1]), None, match or BoneMatch.limbs
     else:
         source = read_skeleton(path, fps=options.fps, root=options.root)

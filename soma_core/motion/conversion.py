@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import logging
+import re
 import shutil
 import tempfile
 import traceback
@@ -15,13 +16,18 @@ from typing import Any
 from soma_core.cache import atomic_text
 from soma_core.errors import InputError, SomaError
 from soma_core.io.motion import Motion
+from soma_core.io.smpl_files import people_of
 from soma_core.motion.back import BackConverter
+from soma_core.motion.bodies import SMPL_LAYOUTS
 from soma_core.motion.converter import Converted, Converter
 from soma_core.motion.files import SUFFIXES, ResultFiles, layout_of
 from soma_core.motion.options import ConvertOptions
 from soma_core.options import Picture
 
-__all__ = ["FolderConverted", "convert", "convert_file", "convert_folder"]
+__all__ = ["FolderConverted", "convert", "convert_file", "convert_folder", "convert_people"]
+
+EVERYONE = "all"
+"""Value of the option ``person`` that means each of them."""
 
 _log = logging.getLogger(__name__)
 
@@ -62,6 +68,48 @@ def convert_file(source: str | Path, out: str | Path, *, options: ConvertOptions
     out = Path(out)
     convert = _converter(options or ConvertOptions())
     return convert(Path(source).expanduser(), ResultFiles.of_folder(out), out / "chunks")
+
+
+def convert_people(
+    source: str | Path, out: str | Path, *, options: ConvertOptions | None = None
+) -> dict[str, Converted]:
+    """Convert the motion of every person in a file of the SMPL family, each into a folder of its own.
+
+    Args:
+        source: the file.
+        out: folder of the results, in which each person has one.
+        options: of the conversions; ``person`` does not count.
+
+    Raises:
+        SomaError: the file, or the backend that it needs, cannot be used, or a fit is none.
+    """
+    source, out = Path(source).expanduser(), Path(out)
+    convert = Converter(options or ConvertOptions())
+    return {
+        person: convert.of_person(person)(source, ResultFiles.of_folder(out / name), out / name / "chunks")
+        for person, name in _people(source).items()
+    }
+
+
+def _people(source: Path) -> dict[str, str]:
+    """Whose motions a file holds, and what their results are called; the only one has no name.
+
+    Raises:
+        InputError: it holds none of the SMPL family.
+    """
+    people = people_of(source) if layout_of(source) in SMPL_LAYOUTS else []
+    if not people:
+        raise InputError(
+            f"{source}: person", got="all, of a file without people to choose from",
+            expected="a file of the SMPL family", fix="Leave person out.",
+        )  # fmt: skip
+    names = {person: re.sub(r"[^\w.-]+", "_", person).strip(".") or "person" for person in people}
+    taken = dict.fromkeys(names.values())
+    return (
+        names
+        if len(taken) == len(names)
+        else {person: f"{n}_{name}" for n, (person, name) in enumerate(names.items())}
+    )
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -114,17 +162,32 @@ def convert_folder(
             fix="Name the folder that holds them.",
         )
     convert, found, rows = _converter(options or ConvertOptions()), FolderConverted(), {}
+    everyone = options is not None and options.person == EVERYONE
     try:
         for number, file in enumerate(files, start=1):
             name = file.relative_to(folder.resolve()).as_posix()
-            rows[name], told = _row(convert, file, out, name, found)
-            level = logging.WARNING if name in found.errors else logging.INFO
-            _log.log(level, "%d of %d: %s: %s", number, len(files), name, told)
+            for one, converter in _converters(convert, file, name, everyone=everyone):
+                rows[one], told = _row(converter, file, out, one, found)
+                level = logging.WARNING if one in found.errors else logging.INFO
+                _log.log(level, "%d of %d: %s: %s", number, len(files), one, told)
     finally:
         document = {"input": str(folder.resolve()), "files": rows}
         atomic_text(out / "report.json", json.dumps(document, indent=2) + "\n")
     shutil.rmtree(out / "chunks", ignore_errors=True)
     return found
+
+
+def _converters(
+    convert: Converter | BackConverter, file: Path, name: str, *, everyone: bool
+) -> list[tuple[str, Converter | BackConverter]]:
+    """What to convert of a file of a folder: the file, or each of its people where all are asked for."""
+    try:
+        people = _people(file) if everyone and isinstance(convert, Converter) else {}
+    except SomaError:
+        people = {}  # said when the file is converted
+    if len(people) < 2 or not isinstance(convert, Converter):
+        return [(name, convert)]
+    return [(f"{name}/{called}", convert.of_person(person)) for person, called in people.items()]
 
 
 def _converter(options: ConvertOptions) -> Converter | BackConverter:

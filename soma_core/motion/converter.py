@@ -14,8 +14,8 @@ from soma_core.errors import AssetError, InputError, SomaError
 from soma_core.io.motion import Motion
 from soma_core.io.motion_files import read_motion
 from soma_core.json_file import read_json
-from soma_core.motion.bodies import FITTED, open_body
-from soma_core.motion.carried import carried, check_carried
+from soma_core.motion.bodies import FITTED, SMPL_SETTINGS, open_body
+from soma_core.motion.carried import SMPL_LAYOUTS, carried, check_carried
 from soma_core.motion.chunks import refuse_other_settings
 from soma_core.motion.files import Layout, ResultFiles, layout_of, read, write
 from soma_core.motion.fit_job import FitJob, FitPlan, fit_settings, plan_body
@@ -82,6 +82,12 @@ class Converter:
         self._options, self._backends = options, FitBackends(options)
         self._products = BodyProducts(options) if options.shown else None
 
+    def of_person(self, person: str) -> Converter:
+        """The same for one person of a file of several, with the same backends and fits."""
+        other = Converter(replace(self._options, person=person))
+        other._backends = self._backends
+        return other
+
     def __call__(self, path: Path, files: ResultFiles, chunks: Path) -> Converted:
         """Convert a file.
 
@@ -100,7 +106,7 @@ class Converter:
         layout = _known_layout(path)
         options = self._options
         check_carried(path, layout, options)
-        retargeted = layout == "skeleton" or (layout == "amass" and options.carry == "skeleton")
+        retargeted = layout == "skeleton" or (layout in SMPL_LAYOUTS and options.carry == "skeleton")
         fitted = layout in FITTED and not retargeted
         if retargeted:
             found = _retargeted(path, layout, options, files)
@@ -130,6 +136,7 @@ class Converter:
 
     def _carry_over(self, path: Path, layout: Layout, files: ResultFiles) -> Converted:
         """Write the rotations of a file on this skeleton as they are, in metres."""
+        _refuse_smpl_settings(path, layout, self._options)
         motion = read(path, fps=self._options.fps, unit=self._options.unit, person=self._options.person)
         write(motion, files.motion)
         report = {
@@ -176,6 +183,22 @@ def _retargeted(path: Path, layout: Layout, options: ConvertOptions, files: Resu
     return Converted(report=report, files=files)
 
 
+def _refuse_smpl_settings(path: Path, layout: Layout, options: ConvertOptions) -> None:
+    """Refuse settings that would change nothing about a file of this skeleton.
+
+    Raises:
+        InputError: one of them is given.
+    """
+    plain = ConvertOptions()
+    for name in SMPL_SETTINGS:
+        value = getattr(options, name)
+        if name not in ("gender", "person") and value != getattr(plain, name):
+            raise InputError(
+                f"{path.name}: {name}", got=str(value), expected=f"none: a {layout} file has no use for it",
+                fix=f"Leave {name} out.",
+            )  # fmt: skip
+
+
 def _known_layout(path: Path) -> Layout:
     """Layout of a file that must hold a motion.
 
@@ -187,7 +210,8 @@ def _known_layout(path: Path) -> Layout:
         raise InputError(
             str(path),
             got="no motion under any key that is known",
-            expected="the keys of an AMASS, SAM 3D Body, kimodo or SOMA file, or a skeleton as BVH, GLB or USD",
+            expected="the keys of a file of the SMPL family, SAM 3D Body, kimodo or SOMA, or a skeleton as BVH, GLB "
+            "or USD",
             fix="Vertices over time are what soma invert takes.",
         )
     return layout

@@ -8,13 +8,14 @@ from pathlib import Path
 from typing import Literal
 
 from soma_core.errors import InputError
-from soma_core.io.amass import holds_smpl_motion
+from soma_core.io.data_files import DATA_SUFFIXES
 from soma_core.io.gem_x import gem_x_parts
 from soma_core.io.motion import Motion
 from soma_core.io.motion_files import read_motion, write_motion
 from soma_core.io.npz_fields import open_npz
 from soma_core.io.sam3d import SAM3D_SUFFIXES
 from soma_core.io.skeleton_files import SKELETON_SUFFIXES
+from soma_core.io.smpl_files import smpl_layout
 from soma_core.io.soma_npz import METRES_PER_UNIT
 from soma_core.motion.writers import WRITERS
 from soma_core.options import LengthUnit, Product
@@ -23,9 +24,9 @@ from soma_core.topology.frames import METRES
 
 __all__ = ["SUFFIXES", "Layout", "ResultFiles", "fingerprint", "layout_of", "read", "write"]
 
-Layout = Literal["soma", "kimodo", "amass", "sam3d", "skeleton"]
+Layout = Literal["soma", "kimodo", "amass", "smpl", "sam3d", "skeleton"]
 
-SUFFIXES = (*SAM3D_SUFFIXES, *SKELETON_SUFFIXES)
+SUFFIXES = tuple(dict.fromkeys((*DATA_SUFFIXES, *SAM3D_SUFFIXES, *SKELETON_SUFFIXES)))
 """Files that may hold a motion."""
 
 
@@ -79,23 +80,25 @@ def layout_of(path: str | Path) -> Layout | None:
     """Which motion a file holds, told by its keys; None where it holds none.
 
     Raises:
-        AssetError: the file is missing, damaged, a git-LFS pointer or no NPZ.
+        AssetError: the file is missing, damaged, a git-LFS pointer or not what its suffix says.
     """
     path = Path(path).expanduser()
-    if path.suffix.lower() == ".parquet":
+    suffix = path.suffix.lower()
+    if suffix == ".parquet":
         return "sam3d"
-    if path.suffix.lower() in SKELETON_SUFFIXES:
+    if suffix in SKELETON_SUFFIXES:
         return "skeleton"
+    if suffix in DATA_SUFFIXES and suffix != ".npz":
+        return smpl_layout(path)
     with open_npz(path) as fields:
         if "global_rot_mats" in fields or "local_rot_mats" in fields:
             return "kimodo"
         if "pred_vertices" in fields:
             return "sam3d"
-        if gem_x_parts(fields) is not None:
+        if "schema_version" in fields or gem_x_parts(fields) is not None:
             return "soma"
-        if holds_smpl_motion(fields):
-            return "amass"
-        return "soma" if "schema_version" in fields or {"poses", "transl"} <= {*fields.names} else None
+        soma = {"poses", "transl"} <= {*fields.names}
+    return smpl_layout(path, readable=soma) or ("soma" if soma else None)
 
 
 def read(

@@ -21,7 +21,7 @@ from soma_core.layer import SomaLayer
 from soma_core.motion.options import FitOptions
 from soma_core.options import ModelOptions
 from soma_core.plugin.registry import default_registry
-from soma_core.plugin.spec import HasPosed
+from soma_core.plugin.spec import HasPosed, HasSkinning
 from soma_core.rig import load_canonical
 from soma_core.topology.correspondence import load_correspondence
 from soma_core.topology.frames import METRES, native_to_canonical
@@ -70,6 +70,28 @@ class FitBackend:
         """The model's own posed vertices; what goes wrong inside names the backend."""
         with default_registry().isolated(self.layer.backend, "rest"), torch.no_grad():
             return self._generator.posed(params, pose)
+
+    @property
+    def mean_hands(self) -> np.ndarray | None:
+        """Mean pose (30, 3) [rad] of the fingers, of a model that has one."""
+        found: np.ndarray | None = getattr(self._generator, "mean_hands", None)
+        return found
+
+    def rest_joints(self, params: Mapping[str, Any]) -> np.ndarray:
+        """Joints (J, 3) of the model's own skeleton at rest, in its unit and axes.
+
+        Raises:
+            InputError: the model does not tell its skeleton.
+        """
+        generator, layer = self._generator, self.layer
+        if not isinstance(generator, HasSkinning):
+            raise InputError(
+                "backend", got=f"{layer.backend}, without a skeleton", expected="one that has it",
+                fix="Pass the posed vertices to soma invert.",
+            )  # fmt: skip
+        given = batch_parameters(layer.spec, params, device=layer.device, dtype=layer.dtype)
+        with default_registry().isolated(layer.backend, "rest"), torch.no_grad():
+            return generator.skinning(given).joints[0].double().cpu().numpy()
 
     @functools.cached_property
     def _generator(self) -> HasPosed:

@@ -8,12 +8,15 @@ from soma_core.errors import InputError
 from soma_core.motion.writers import MESH_WRITERS, WriteOptions
 from soma_core.options import (
     BackendChoice,
+    BetasFrom,
     BodyGender,
     BoneMatch,
     Carry,
     Contacts,
     ConvertResult,
+    Coordinates,
     FitLod,
+    Gaps,
     Ground,
     IdentityChoice,
     InversionChoice,
@@ -22,7 +25,9 @@ from soma_core.options import (
     Options,
     Picture,
     Product,
+    RotationLayout,
     SmplLayout,
+    SmplModel,
     Topology,
     Translation,
     Upward,
@@ -101,10 +106,18 @@ class ConvertOptions(WriteOptions, FitOptions):
         result: of the way back; None: poses of SMPL models, vertices of others.
         gender: of SMPL models; None: that of the file.
         most_betas: how many of a file's shape coefficients are used; None: all.
-        betas: shape coefficients of the model, on the way back; None: the body's own, or the nearest.
+        betas: shape coefficients of SMPL models; None: those of the file, on the way back the body's own, or
+            the nearest.
+        betas_from: what is made of a file's shapes for each frame.
+        model: of the SMPL family, that a file's poses are of; None: as the file tells.
+        person: whose motion, in a file of several people; ``all`` for a motion of each.
+        coordinates: the motion in the world or in the camera; None: the world where the file has it.
+        rotation_layout: of quaternions and 6D rotations; None: as the numbers tell.
+        flat_hand_mean: whether zero is a flat hand; None: as the file says, or flat.
+        gaps: what becomes of frames that a file lacks or where it holds NaN.
+        longest_gap: that is interpolated [s].
         num_betas: how many are written; None: as many as the body's file or the model has, 10 at least.
         layout: names of the keys that poses of SMPL models are written under; None: those of AMASS.
-        person: whose motion, in a file of several people.
         translation: where the body stands, on the way back and in what is written of a body.
         ground: what lies on the floor then; None: the usual for that translation.
         contacts: whether feet that stand are pinned then.
@@ -125,9 +138,16 @@ class ConvertOptions(WriteOptions, FitOptions):
     gender: BodyGender | None = None
     most_betas: int | None = None
     betas: list[float] | None = None
+    betas_from: BetasFrom = BetasFrom.mean
+    model: SmplModel | None = None
+    person: str | None = None
+    coordinates: Coordinates | None = None
+    rotation_layout: RotationLayout | None = None
+    flat_hand_mean: bool | None = None
+    gaps: Gaps = Gaps.interpolate
+    longest_gap: float = 1.0
     num_betas: int | None = None
     layout: SmplLayout | None = None
-    person: str | None = None
     translation: Translation = Translation.motion
     ground: Ground | None = None
     contacts: Contacts = Contacts.free
@@ -147,12 +167,13 @@ class ConvertOptions(WriteOptions, FitOptions):
             raise InputError("num_betas", got=self.num_betas, expected="at least 1", fix="Try num_betas=10.")
         sought = None if self.identity.method == "known" else str(self.identity.method)
         unused: dict[str, object] = {"identity.method": sought, "most_betas": self.most_betas}
+        unused |= {name: getattr(self, name) for name in ("model", "coordinates", "rotation_layout")}
         why = f"to={self.to}"
         if self.to == "soma":
             placed = None if self.translation == "motion" or self.shown else str(self.translation)
             held = None if self.contacts == "free" or self.shown else str(self.contacts)
             unused = {
-                "betas": self.betas, "num_betas": self.num_betas, "layout": self.layout,
+                "num_betas": self.num_betas, "layout": self.layout,
                 "result": self.result, "translation": placed, "contacts": held,
                 "ground": None if self.shown else self.ground,
             }  # fmt: skip

@@ -9,7 +9,13 @@ from typing import TYPE_CHECKING
 from omegaconf import OmegaConf
 
 from soma_core.errors import AssetError, InputError, SomaError
-from soma_core.motion.conversion import FolderConverted, convert_file, convert_folder
+from soma_core.motion.conversion import (
+    EVERYONE,
+    FolderConverted,
+    convert_file,
+    convert_folder,
+    convert_people,
+)
 
 if TYPE_CHECKING:
     from omegaconf import DictConfig
@@ -38,6 +44,9 @@ def run(config: DictConfig, output: Path) -> None:
     try:
         if path.is_dir():
             _say(path, convert_folder(path, output, options=options), output / "report.json")
+        elif options.person == EVERYONE:
+            for person, converted in convert_people(path, output, options=options).items():
+                _log.info("%s, person %s: %s", path.name, person or "without a name", converted)
         else:
             found = convert_file(path, output, options=options)
             _log.info("%s: %s", path.name, found)

@@ -7,6 +7,7 @@ import io
 import pickle
 import struct
 import zipfile
+import zlib
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -76,6 +77,50 @@ def _pickles() -> Iterator[tuple[str, bytes]]:
     yield "pickle with an empty stack", b"\x80\x020."
     yield "pickle of nothing", b"."
     yield "pickle of a forgotten memory", b"\x80\x02h\x05."
+
+
+def _graphs() -> Iterator[tuple[str, bytes]]:
+    """Pickles of a few bytes whose values lie in each other many times, or for ever."""
+    many = 300
+    wide: object = np.arange(3.0)
+    for _ in range(6):
+        wide = [wide] * many
+    body: dict[object, object] = {"pose": wide, "trans": wide, "betas": wide, "global_orient": wide}
+    yield "pickle of lists in lists", pickle.dumps(body)
+    yield "pickle of one array many times", pickle.dumps({"pose": [np.zeros((2000, 72))] * 4000, "trans": 1})
+    frame = {"smpl": [{"global_orient": wide, "body_pose": wide}] * 3000, "tid": list(range(3000))}
+    yield "pickle of tracks in tracks", pickle.dumps(dict.fromkeys(range(3000), frame))
+    yield "pickle of frames in frames", pickle.dumps([dict.fromkeys(map(str, range(3000)), wide)] * 3000)
+    body["people"] = body
+    yield "pickle of itself", pickle.dumps(body)
+    tree: dict[object, object] = {"pose": np.zeros((2, 71))}
+    for _ in range(12):
+        tree = dict.fromkeys(range(200), tree)
+    yield "pickle of a tree without end", pickle.dumps(tree)
+    layout = {"dtype": np.dtype("f8"), "order": "C", "subclass": np.ndarray, "allow_mmap": True}
+    wrapper = b"cjoblib.numpy_pickle\nNumpyArrayWrapper\n)\x81"
+    for name, shape in (("huge", (2**40,)), ("negative", (-1,)), ("text", "abc"), ("no", None)):
+        state = pickle.dumps(layout | {"shape": shape}, 2)[2:-1]
+        yield f"pickle of joblib with {name} shape", b"\x80\x02" + wrapper + state + b"b."
+    state = pickle.dumps(layout | {"shape": (1,), "dtype": np.dtype("O")}, 2)[2:-1]
+    yield "pickle of joblib with code", b"\x80\x02" + wrapper + state + b"b" + pickle.dumps(_touches()) + b"."
+    yield "pickle of joblib in itself", b"\x80\x02" + (wrapper + state + b"b\x80\x02") * 3000
+    storage = b"ctorch._utils\n_rebuild_tensor_v2\n(ctorch.storage\n_load_from_bytes\n"
+    inner = pickle.dumps(_touches(), 2)
+    loaded = (
+        storage + b"B" + struct.pack("<I", len(inner)) + inner + b"\x85RK\x00(K\x02K\x48t(K\x48K\x01t\x89Nt"
+    )
+    yield "pickle of a tensor with code", b"\x80\x02}U\x04pose" + loaded + b"Rs."
+    yield "pickle compressed with zlib, cut off", zlib.compress(bytes(10_000))[:-6]
+    yield "pickle compressed with gzip, damaged", b"\x1f\x8b" + bytes(30)
+    yield "pickle compressed with lz4", b"\x04\x22\x4d\x18" + bytes(30)
+
+
+@functools.cache
+def _zlib_bomb() -> bytes:
+    """Zeros in a thousandth of their size."""
+    packer = zlib.compressobj(1)
+    return b"".join(packer.compress(bytes(1 << 22)) for _ in range(BOMB_BYTES >> 22)) + packer.flush()
 
 
 def _structured_pickles() -> Iterator[tuple[str, bytes]]:
@@ -311,8 +356,10 @@ def _plain() -> Iterator[tuple[str, bytes]]:
 
 
 def _all() -> dict[str, bytes | Callable[[], bytes]]:
-    found: dict[str, bytes | Callable[[], bytes]] = {"npz bomb": _bomb}
-    parts = (_plain, _pickles, _structured_pickles, _arrays, _archives, _meshes, _scenes, _skeletons, made)
+    found: dict[str, bytes | Callable[[], bytes]] = {"npz bomb": _bomb, "pickle bomb of zlib": _zlib_bomb}
+    parts = (
+        _plain, _pickles, _structured_pickles, _graphs, _arrays, _archives, _meshes, _scenes, _skeletons, made,
+    )  # fmt: skip
     for part in parts:
         found.update(part())
     return found

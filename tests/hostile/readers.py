@@ -18,7 +18,7 @@ from soma_backend_smpl.family import SMPL
 from assets.make.twist_template import procedural_document
 from soma_core.backends.native import component_count
 from soma_core.correctives.weights import read_weights
-from soma_core.io import open_vertex_sequence, read_amass, read_motion
+from soma_core.io import open_vertex_sequence, read_amass, read_motion, read_smpl
 from soma_core.io.mesh_vertices import read_mesh_vertices, read_ply_triangles
 from soma_core.io.pickled_arrays import read_pickled_arrays
 from soma_core.io.sam3d import read_sam3d
@@ -30,6 +30,8 @@ from soma_core.rig.neutral import load_shape_space, read_topology
 from soma_core.rig.procedural_json import read_procedural
 from soma_core.rig.usd import read_usd_rig
 from soma_core.tasks.wrap import read_landmarks
+from tests.io.smpl_layouts import TURNS as SMPLX_TURNS
+from tests.io.smpl_layouts import save_joblib, save_npy, save_npz, save_pt, smplx_names, wham
 from tests.standins.pickles import ch, csc, select, write_pickle
 
 __all__ = ["READERS", "Reader"]
@@ -98,6 +100,11 @@ def _amass(path: Path) -> None:
         path, poses=np.zeros((FRAMES, 156)), trans=np.zeros((FRAMES, 3)), betas=np.zeros(16),
         gender=np.array("male"), mocap_framerate=120.0,
     )  # fmt: skip
+
+
+def _estimated(save: Callable[[Path, Any], None]) -> Callable[[Path], None]:
+    """A result of a video estimator, in a container."""
+    return lambda path: save(path, {"smpl_params_global": smplx_names(SMPLX_TURNS)})
 
 
 def _shape_space(path: Path) -> None:
@@ -286,6 +293,13 @@ READERS = [
     Reader(name="motion", suffix=".npz", read=read_motion, good=_motion),
     Reader(name="kimodo motion", suffix=".npz", read=read_motion, good=_kimodo),
     Reader(name="amass motion", suffix=".npz", read=read_amass, good=_amass),
+    Reader(name="smpl npz of objects", suffix=".npz", read=read_smpl, good=_estimated(save_npz)),
+    Reader(name="smpl npy", suffix=".npy", read=read_smpl, good=_estimated(save_npy)),
+    Reader(name="smpl torch", suffix=".pt", read=read_smpl, good=_estimated(save_pt)),
+    Reader(
+        name="smpl joblib", suffix=".pkl", read=read_smpl,
+        good=lambda path: save_joblib(path, {0: wham()[0]}),
+    ),
     Reader(name="sam 3d body", suffix=".npz", read=read_sam3d),
     Reader(name="shape space", suffix=".npz", read=load_shape_space, good=_shape_space),
     Reader(

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from soma_core.errors import AssetError, InputError
-from soma_core.io.amass import SMPL_JOINTS, SmplMotion, read_amass, write_amass
+from soma_core.io.amass import SMPL_JOINTS, SmplMotion, write_amass
+from soma_core.io.smpl_files import read_amass
 
 FRAMES = 4
 
@@ -91,15 +92,13 @@ def test_what_is_written_is_read_again(tmp_path, model):
         (smplh_file(poses=np.zeros((FRAMES, 150))), r"poses: got shape \(4, 150\), expected 72 values"),
         (smplh_file(poses=np.zeros((0, 156))), r"poses: got shape \(0, 156\)"),
         (smplh_file(trans=np.zeros((FRAMES, 2))), r"trans: got shape \(4, 2\)"),
-        (smplh_file(trans=np.full((FRAMES, 3), np.nan)), r"trans: got nan at index \(0, 0\)"),
+        (smplh_file(trans=np.full((FRAMES, 3), np.nan)), r"trans: got NaN or infinity in every frame"),
         (smplh_file(mocap_framerate=None), "mocap_framerate: got no frame rate.*Pass fps=120"),
         (smplh_file(mocap_framerate=-1), "mocap_framerate: got -1, expected a positive number"),
         (smplh_file(gender="unknown"), "gender: got 'unknown'.*Pass gender=neutral"),
         (smplh_file(gender=None), "gender: got only the keys.*expected a key 'gender'"),
-        (smplh_file(betas=np.eye(FRAMES)), "betas: got 4 rows that differ"),
         (smplh_file(betas=np.zeros((2, 10))), "betas: got 2 rows, expected one row"),
         (smplh_file(betas=np.zeros((2, 3, 4))), r"betas: got shape \(2, 3, 4\)"),
-        (smplx_file(pose_hand=None), "pose_hand: got only the keys"),
         (smplx_file(pose_eye=np.zeros((FRAMES, 3))), r"pose_eye: got shape \(4, 3\)"),
         (smplh_file(poses=np.array([{}], object)), "poses: got an unreadable array .Python objects"),
     ],
@@ -120,7 +119,8 @@ def test_what_is_no_file_is_refused(tmp_path):
     [
         ({"model": "mano"}, "model: got 'mano', expected one of 'smpl', 'smplh', 'smplx'"),
         ({"gender": "any"}, "gender: got 'any'"),
-        ({"up": "-y"}, "up: got '-y'"),
+        ({"up": "+x"}, r"up: got '\+x'"),
+        ({"about": "head"}, "about: got 'head'"),
         ({"fps": 0}, "fps: got 0, expected a positive number"),
         ({"rotations": np.zeros((FRAMES, 24, 3))}, r"rotations: got shape \(4, 24, 3\), .* \(4, 52, 3\)"),
         ({"rotations": np.zeros((0, 52, 3))}, r"rotations: got shape \(0, 52, 3\)"),

@@ -10,7 +10,7 @@ from soma_core import SomaLayer
 from soma_core.errors import InputError
 from soma_core.inversion import PoseInversion
 from soma_core.io import open_vertex_sequence, write_motion
-from soma_core.io.amass import read_amass
+from soma_core.io.smpl_files import read_amass
 from soma_core.motion import BackendChoice, back
 from tests.motion.conftest import AMASS_FRAMES
 from tests.motion.test_converter import converted, motion, posed_smplh

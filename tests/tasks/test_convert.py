@@ -96,7 +96,7 @@ def test_files_of_one_name_and_two_suffixes_stay_apart(tmp_path):
 @pytest.mark.parametrize(
     ("content", "said"),
     [
-        ({}, "got no file ending in .npz or .parquet, expected motion files"),
+        ({}, "got no file ending in .npz or .npy or .pkl .*, expected motion files"),
         ({"a.npz": {"betas": 1}}, "got 1 files without a motion"),
         ({"a.npz": {"poses": 1, "trans": 1}}, r"a\.npz: poses: got shape \(\)"),
     ],
@@ -116,7 +116,10 @@ def test_a_folder_without_a_motion_is_refused(tmp_path, content, said):
         (["input=m.npz", "chunk=0"], "chunk: got 0, expected at least 1"),
         (["input=m.npz", "gender=x"], "gender: "),
         (["input=m.npz", "to=smplz"], "smplz"),
-        (["input=m.npz", "betas=[1]"], "betas: got [1.0], expected none with to=soma"),
+        (
+            ["input=m.npz", "betas=[1]"],
+            "m.npz: betas: got [1.0], expected none: a soma file has no use for it",
+        ),
         (["input=m.npz", "backend=soma"], "backend: got soma, expected none with to=soma and identity=known"),
         (["input=m.npz", "translation=ground"], "translation: got ground, expected none with to=soma"),
         (["input=m.npz", "to=smplh", "most_betas=1"], "most_betas: got 1, expected none with to=smplh"),

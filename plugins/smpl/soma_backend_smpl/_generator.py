@@ -62,6 +62,11 @@ class SmplGenerator:
             )
         return betas[:, : len(self._basis)]
 
+    @property
+    def mean_hands(self) -> np.ndarray | None:
+        """Axis-angle vectors (30, 3) [rad] of the fingers' mean pose, where the model's file has it."""
+        return None if self._model.mean_hands is None else self._model.mean_hands.reshape(30, 3)
+
     def rest_joints(self, params: Mapping[str, Tensor]) -> Tensor:
         """Joints (batch, J, 3) [m] of the rest mesh, in the order of ``family.joint_names``."""
         return self._regressor @ self.rest(params)

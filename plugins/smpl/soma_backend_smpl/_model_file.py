@@ -15,6 +15,8 @@ from soma_core.plugin import open_npz_file
 __all__ = ["KEYS", "ModelFile", "read_model", "shape_width"]
 
 KEYS = ("v_template", "shapedirs", "posedirs", "J_regressor", "weights", "kintree_table", "f")
+HAND_KEYS = ("hands_meanl", "hands_meanr")
+"""Mean poses of the hands, which only files of SMPL-H and SMPL-X have."""
 _HEAD, _LEFT_HIP, _RIGHT_HIP = 15, 1, 2
 _SUM_TOLERANCE = 1e-4  # float32 weights of some influences
 _REGRESSOR_TOLERANCE = 1e-2  # sums of regressors fitted by least squares
@@ -36,6 +38,8 @@ class ModelFile:
         regressor: (J, v) joints from vertices, rows sum to 1.
         weights: (v, J) skinning weights.
         faces: (t, 3) int64.
+        mean_hands: (90,) axis-angle values of the fingers' mean pose, left hand first; None where there are
+            none.
     """
 
     family: Family
@@ -47,6 +51,7 @@ class ModelFile:
     regressor: np.ndarray
     weights: np.ndarray
     faces: np.ndarray
+    mean_hands: np.ndarray | None = None
 
     def arrays(self) -> dict[str, np.ndarray]:
         """The arrays under the keys of the official files, in single precision."""
@@ -58,6 +63,8 @@ class ModelFile:
             "J_regressor": self.regressor,
             "weights": self.weights,
         }
+        if self.mean_hands is not None:
+            found |= dict(zip(HAND_KEYS, np.split(self.mean_hands, 2), strict=True))
         single = {key: value.astype(np.float32) for key, value in found.items()}
         return single | {"kintree_table": kintree, "f": self.faces.astype(np.int32)}
 
@@ -83,7 +90,9 @@ def read_model(path: Path, family: Family) -> ModelFile:
         AssetError: missing, damaged, code in a pickle, another model, or arrays that cannot be a body; the
             text names the key, what it holds and what was expected.
     """
-    arrays = _read(path, KEYS)
+    arrays = _read(path, (*KEYS, *HAND_KEYS))
+    hands = [arrays.pop(key, np.zeros(0)).astype(np.float64).ravel() for key in HAND_KEYS]
+    sound = all(hand.size == 45 and np.isfinite(hand).all() for hand in hands)
     _check_layouts(path, family, arrays)
     values = {
         key: value.astype(np.float64) for key, value in arrays.items() if key not in ("f", "kintree_table")
@@ -108,6 +117,7 @@ def read_model(path: Path, family: Family) -> ModelFile:
         regressor=values["J_regressor"],
         weights=values["weights"],
         faces=faces,
+        mean_hands=np.concatenate(hands) if sound else None,
     )
     _check_body(model, arrays["kintree_table"])
     return model
