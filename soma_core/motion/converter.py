@@ -154,7 +154,7 @@ def _products_before(report: Path) -> Mapping[str, Any]:
     """What an earlier report says of products; nothing where there is none of ours."""
     try:
         return dict(_read_report(report)["products"])
-    except (OSError, ValueError, KeyError, TypeError):
+    except (SomaError, OSError, ValueError, KeyError, TypeError):
         return {}
 
 
