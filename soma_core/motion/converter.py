@@ -142,7 +142,7 @@ def _known_layout(path: Path) -> Layout:
         raise InputError(
             str(path),
             got="no motion under any key that is known",
-            expected="the keys of an AMASS, SAM 3D Body, kimodo or SOMA file, or a skeleton as BVH, GLB or USD",
+            expected="the keys of an AMASS, SAM 3D Body, kimodo or SOMA file, or a skeleton (BVH, GLB, USD)",
             fix="Vertices over time are what soma invert takes.",
         )
     return layout
