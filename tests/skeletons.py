@@ -20,8 +20,8 @@ def biped(
 ) -> tuple[tuple[str, ...], np.ndarray, np.ndarray]:
     """Names, parents and places [m] of a person in T-pose; `names` gives what its tool calls a part.
 
-    Parts are ``hips spine neck head`` and, with ``L`` or ``R`` before them, ``collar arm elbow wrist finger thigh
-    knee ankle toe``; ``spine`` is a format of the number.
+    Parts are ``hips spine neck head`` and, with ``L`` or ``R`` before them, ``collar arm elbow wrist finger
+    thigh knee ankle toe``; ``spine`` is a format of the number.
     """
     rows: list[tuple[str, str | None, tuple[float, float, float]]] = [("hips", None, (0, 0.97, 0))]
     above = "hips"

@@ -24,8 +24,8 @@ _log = logging.getLogger(__name__)
 _MOST_JOINTS = 4096
 _CHUNK = 1 << 23
 _WORD = re.compile(
-    rb"(?i:(ROOT|JOINT)[ \t]+([^\r\n{}]+))|(?i:(End)[ \t]*Site[^\r\n{}]*)|(?i:(OFFSET|CHANNELS)\b([^\r\n{}]*))"
-    rb"|(?i:^[ \t]*(MOTION)\b)|([{}])|(?:\#|//)[^\r\n]*|(\S+)",
+    rb"(?i:(ROOT|JOINT)[ \t]+([^\r\n{}]+))|(?i:(End)[ \t]*Site[^\r\n{}]*)"
+    rb"|(?i:(OFFSET|CHANNELS)\b([^\r\n{}]*))|(?i:^[ \t]*(MOTION)\b)|([{}])|(?:\#|//)[^\r\n]*|(\S+)",
     re.MULTILINE,
 )
 _HEAD = re.compile(rb"(?i:Frames[ \t]*:?[ \t]*(\S+))|(?i:Frame[ \t]*Time[ \t]*:?[ \t]*(\S+))")

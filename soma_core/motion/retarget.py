@@ -49,8 +49,8 @@ def retarget(
     A joint keeps its change of world orientation since the rest pose, after the rest poses are brought
     together: each bone of this skeleton is first turned, from where its parent's went, by the shortest way to
     the direction of the other's bone at rest, so that bones point the same way in every frame. Where a
-    rest pose is no human pose (all bones along one axis), the twist about a bone comes from the bends of knees and
-    elbows. Spines of another number of joints share out their turn; others stay at rest.
+    rest pose is no human pose (all bones along one axis), the twist about a bone comes from the bends of
+    knees and elbows. Spines of another number of joints share out their turn; others stay at rest.
 
     The path is scaled by the length of the legs, so that feet reach the ground on the rig's own body; motions
     under this skeleton's own names keep theirs.
