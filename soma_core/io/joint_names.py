@@ -189,10 +189,13 @@ def _entries(document: Mapping) -> Iterator[tuple[str, str]]:
                 yield name.replace("*", side), target.replace("*", side)
         templates = document["fingers"]
         for template in [templates] if isinstance(templates, str) else templates:
-            for finger, spellings in _FINGERS.items():
-                for spelling in spellings:
-                    stem = template.replace("*", side).replace("{finger}", spelling)
-                    yield from _phalanges(stem, side, finger, document["first"])
+            yield from _fingers(template.replace("*", side), side, document["first"])
+
+
+def _fingers(template: str, side: str, first: int) -> Iterator[tuple[str, str]]:
+    for finger, spellings in _FINGERS.items():
+        for spelling in spellings:
+            yield from _phalanges(template.replace("{finger}", spelling), side, finger, first)
 
 
 def _phalanges(stem: str, side: str, finger: str, first: int) -> Iterator[tuple[str, str]]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -91,21 +91,24 @@ def retarget(
         rig_revision=rig.revision,
         source=source.source,
     )
-    named = {name: source.names[joint] for name, joint in joints.items()}
+    report = _joints_report(source, joints, spine, neck) | {
+        "rest_pose": alignment.kind, "unit_metres": found.metres, "up": found.up, "legs_metres": legs,
+        "path_scale": scale, "at_rest": [name for name in USER_JOINTS if name not in goals],
+    }  # fmt: skip
+    return Retargeted(motion=motion, report=report)
+
+
+def _joints_report(
+    source: SkeletonMotion, joints: Mapping[str, int], spine: Sequence[int], neck: Sequence[int]
+) -> dict[str, Any]:
+    """Which joint became which, and which were left."""
     used = {*joints.values(), *spine, *neck}
-    report = {
-        "joints": named,
+    return {
+        "joints": {name: source.names[joint] for name, joint in joints.items()},
         "spine": [source.names[joint] for joint in spine],
         "neck": [source.names[joint] for joint in neck],
-        "rest_pose": alignment.kind,
-        "unit_metres": found.metres,
-        "up": found.up,
-        "legs_metres": legs,
-        "path_scale": scale,
         "not_carried": [name for joint, name in enumerate(source.names) if joint not in used],
-        "at_rest": [name for name in USER_JOINTS if name not in goals],
     }
-    return Retargeted(motion=motion, report=report)
 
 
 def _spread(

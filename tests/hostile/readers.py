@@ -233,7 +233,8 @@ READERS = [
         name="vertices usd", suffix=".usda", read=_frames, good=_usd,
         accepts=(
             "usda of a repeated joint", "usda of faces out of range", "usda of negative faces",
-            "usda of negative face counts", "usda of weights of NaN", "usda of points of NaN",
+            "usda of negative face counts",
+            "usda of weights of NaN", "usda of points of NaN",
         ),
     ),
     Reader(name="vertices usdc", suffix=".usdc", read=_frames),
