@@ -246,7 +246,8 @@ READERS = [
         name="joints of a usd", suffix=".usda", read=read_skeleton, good=_usd,
         accepts=(
             "usda of joint indices out of range", "usda of negative joint indices",
-            "usda of faces out of range", "usda of negative faces", "usda of negative face counts", "usda of weights of NaN",
+            "usda of faces out of range", "usda of negative faces",
+            "usda of negative face counts", "usda of weights of NaN",
             "usda of points of NaN", "usda of a huge element size", "usda of an element size of zero",
         ),
     ),
