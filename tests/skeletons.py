@@ -20,8 +20,8 @@ def biped(
 ) -> tuple[tuple[str, ...], np.ndarray, np.ndarray]:
     """Names, parents and places [m] of a person in T-pose; `names` gives what its tool calls a part.
 
-    Parts are ``hips spine neck head`` and, with ``L`` or ``R`` before them, ``collar arm elbow wrist finger thigh
-    knee ankle toe``; ``spine`` is a format of the number.
+    Parts are ``hips spine neck head`` and, with ``L`` or ``R`` before them, ``collar arm elbow wrist finger
+    thigh knee ankle toe``; ``spine`` is a format of the number.
     """
     rows: list[tuple[str, str | None, tuple[float, float, float]]] = [("hips", None, (0, 0.97, 0))]
     above = "hips"
@@ -30,15 +30,23 @@ def biped(
         above = f"spine{number}"
     rows += [("neck", above, (0, 0.1, 0.01)), ("head", "neck", (0, 0.1, 0.02))]
     for side, x in (("L", 1), ("R", -1)):
-        chain = [("collar", above, (0.05 * x, 0.06, 0.0)), ("arm", "collar", (0.13 * x, -0.01, -0.01)),
-                 ("elbow", "arm", (0.28 * x, 0.0, -0.01)), ("wrist", "elbow", (0.25 * x, 0.01, 0.01))]  # fmt: skip
+        chain = [
+            ("collar", above, (0.05 * x, 0.06, 0.0)),
+            ("arm", "collar", (0.13 * x, -0.01, -0.01)),
+            ("elbow", "arm", (0.28 * x, 0.0, -0.01)),
+            ("wrist", "elbow", (0.25 * x, 0.01, 0.01)),
+        ]
         if hands:
             chain += [
                 ("finger1", "wrist", (0.09 * x, 0.0, 0.01)),
                 ("finger2", "finger1", (0.04 * x, -0.005, 0.0)),
             ]
-        chain += [("thigh", "hips", (0.09 * x, -0.05, 0.0)), ("knee", "thigh", (0.01 * x, -0.41, 0.01)),
-                  ("ankle", "knee", (0.0, -0.42, -0.02)), ("toe", "ankle", (0.01 * x, -0.07, 0.13))]  # fmt: skip
+        chain += [
+            ("thigh", "hips", (0.09 * x, -0.05, 0.0)),
+            ("knee", "thigh", (0.01 * x, -0.41, 0.01)),
+            ("ankle", "knee", (0.0, -0.42, -0.02)),
+            ("toe", "ankle", (0.01 * x, -0.07, 0.13)),
+        ]
         parts = {part for part, *_ in chain}
         rows += [
             (side + part, side + parent if parent in parts else parent, place)

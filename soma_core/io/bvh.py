@@ -55,9 +55,11 @@ def write_bvh(
         InputError: a choice that is none, or a motion on this skeleton without its rig.
     """
     for name, value, among in (
-        ("order", order, _ORDERS), ("rest", rest, ("t_pose", "bind")), ("unit", unit, METRES),
+        ("order", order, _ORDERS),
+        ("rest", rest, ("t_pose", "bind")),
+        ("unit", unit, METRES),
         ("joints", joints, (77, 78)),
-    ):  # fmt: skip
+    ):
         if value not in among:
             expected = "one of " + ", ".join(map(str, among))
             raise InputError(name, got=repr(value), expected=expected, fix="Correct it.")
@@ -161,6 +163,6 @@ def _end(motion: SkeletonMotion, joint: int, bone: np.ndarray) -> np.ndarray:
     """Where the bone of a joint without children ends: as told, else a little further the same way."""
     if motion.ends is not None and np.isfinite(motion.ends[joint]).all():
         return np.asarray(motion.ends[joint])
-    length = np.linalg.norm(bone)
+    length = float(np.linalg.norm(bone))
     direction = bone / length if length > 0 else np.array([0.0, 1.0, 0.0])
     return np.asarray(direction * max(0.3 * min(length, 0.1), _SHORTEST))

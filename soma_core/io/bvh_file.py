@@ -24,9 +24,10 @@ _log = logging.getLogger(__name__)
 _MOST_JOINTS = 4096
 _CHUNK = 1 << 23
 _WORD = re.compile(
-    rb"(?i:(ROOT|JOINT)[ \t]+([^\r\n{}]+))|(?i:(End)[ \t]*Site[^\r\n{}]*)|(?i:(OFFSET|CHANNELS)\b([^\r\n{}]*))"
-    rb"|(?i:^[ \t]*(MOTION)\b)|([{}])|(?:\#|//)[^\r\n]*|(\S+)", re.MULTILINE,
-)  # fmt: skip
+    rb"(?i:(ROOT|JOINT)[ \t]+([^\r\n{}]+))|(?i:(End)[ \t]*Site[^\r\n{}]*)"
+    rb"|(?i:(OFFSET|CHANNELS)\b([^\r\n{}]*))|(?i:^[ \t]*(MOTION)\b)|([{}])|(?:\#|//)[^\r\n]*|(\S+)",
+    re.MULTILINE,
+)
 _HEAD = re.compile(rb"(?i:Frames[ \t]*:?[ \t]*(\S+))|(?i:Frame[ \t]*Time[ \t]*:?[ \t]*(\S+))")
 _RATES = (
     24,
@@ -92,8 +93,13 @@ def read_bvh(path: str | Path, *, fps: float | None = None, root: str | None = N
     frames = len(values) // width
     if announced != str(frames) or len(values) % width:
         cut = f" and {len(values) % width} of the {width} numbers of another" if len(values) % width else ""
-        _log.warning("%s: announces %s frames and holds %d%s; the whole ones are read",
-                     path.name, announced, frames, cut)  # fmt: skip
+        _log.warning(
+            "%s: announces %s frames and holds %d%s; the whole ones are read",
+            path.name,
+            announced,
+            frames,
+            cut,
+        )
     rows = values[: frames * width].reshape(frames, width)
     return _motion(path, tree, rows, rate, root)
 
@@ -202,12 +208,20 @@ def _frame_rate(path: Path, frame_time: str | None, fps: float | None) -> float:
     except ValueError:
         seconds = float("nan")
     if 5 <= seconds <= 1000:
-        _log.warning("%s: a frame time of %g s is read as a rate of %g frames a second; fps= says another",
-                     path.name, seconds, seconds)  # fmt: skip
+        _log.warning(
+            "%s: a frame time of %g s is read as a rate of %g frames a second; fps= says another",
+            path.name,
+            seconds,
+            seconds,
+        )
         return seconds
     if not 5e-4 <= seconds <= 1:
-        raise InputError(f"{path}: Frame Time", got=frame_time or "none", expected="seconds from one frame to the next",
-                         fix="Pass fps=30 (the true rate).")  # fmt: skip
+        raise InputError(
+            f"{path}: Frame Time",
+            got=frame_time or "none",
+            expected="seconds from one frame to the next",
+            fix="Pass fps=30 (the true rate).",
+        )
     digits = len(str(frame_time).partition(".")[2]) if "e" not in str(frame_time).lower() else 9
     near = min(_RATES, key=lambda rate: abs(1 / rate - seconds))
     return float(near) if abs(1 / near - seconds) < 10.0**-digits else 1 / seconds
@@ -245,8 +259,12 @@ def _parsed(path: Path, piece: bytes) -> np.ndarray:
     except (ValueError, DeprecationWarning):
         pass
     wrong = next((word for word in piece.split() if not _is_number(word)), b"?")
-    raise InputError(f"{path}: MOTION", got=repr(wrong[:20].decode("ascii", "replace")), expected="finite numbers",
-                     fix="Correct or delete the frame.")  # fmt: skip
+    raise InputError(
+        f"{path}: MOTION",
+        got=repr(wrong[:20].decode("ascii", "replace")),
+        expected="finite numbers",
+        fix="Correct or delete the frame.",
+    )
 
 
 def _is_number(word: bytes) -> bool:
@@ -286,9 +304,16 @@ def _motion(path: Path, tree: _Tree, rows: np.ndarray, fps: float, root: str | N
             moves[index] = bone
     place = moves.pop(0, np.tile(offsets[0], (len(rows), 1)))
     return SkeletonMotion(
-        names=tuple(tree.names[joint] for joint in kept), parents=parents, rest=rest, rotations=rotations, root=place,
-        fps=fps, ends=np.array([tree.ends[joint] for joint in kept]), moves=_that_move(moves, offsets), source=path.name,
-    )  # fmt: skip
+        names=tuple(tree.names[joint] for joint in kept),
+        parents=parents,
+        rest=rest,
+        rotations=rotations,
+        root=place,
+        fps=fps,
+        ends=np.array([tree.ends[joint] for joint in kept]),
+        moves=_that_move(moves, offsets),
+        source=path.name,
+    )
 
 
 def _that_move(moves: dict[int, np.ndarray], offsets: np.ndarray) -> dict[int, np.ndarray]:
@@ -302,6 +327,10 @@ def _root(path: Path, tree: _Tree, name: str | None) -> int:
     named = [joint for joint in roots if tree.names[joint] == name] if name else roots
     if len(named) != 1:
         names = ", ".join(tree.names[joint] for joint in roots)
-        raise InputError(f"{path}: root", got=name or f"{len(roots)} skeletons", expected=f"one of {names}",
-                         fix=f"Pass root={tree.names[roots[0]]} (the one you want).")  # fmt: skip
+        raise InputError(
+            f"{path}: root",
+            got=name or f"{len(roots)} skeletons",
+            expected=f"one of {names}",
+            fix=f"Pass root={tree.names[roots[0]]} (the one you want).",
+        )
     return named[0]

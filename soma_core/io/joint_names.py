@@ -19,22 +19,46 @@ __all__ = ["match_joints", "read_mapping"]
 _TOKENS = re.compile(r"[A-Z]+(?=[A-Z][a-z])|[A-Z]?[a-z]+|[A-Z]+|\d+")
 _SIDES = {"l": "Left", "left": "Left", "lft": "Left", "r": "Right", "right": "Right", "rgt": "Right"}
 _PREFIXES = {
-    "mixamorig", "bip", "biped", "character", "ctrl", "def", "org", "j", "bind", "valve", "cc", "base", "skel", "jnt",
+    "mixamorig",
+    "bip",
+    "biped",
+    "character",
+    "ctrl",
+    "def",
+    "org",
+    "j",
+    "bind",
+    "valve",
+    "cc",
+    "base",
+    "skel",
+    "jnt",
     "bn",
-}  # fmt: skip
+}
 """Words that rigs put before every name, and a number after them."""
 
-_FINGERS = {"Thumb": ("thumb",), "Index": ("index",), "Middle": ("middle", "mid"), "Ring": ("ring",),
-            "Pinky": ("pinky", "little", "small")}  # fmt: skip
+_FINGERS = {
+    "Thumb": ("thumb",),
+    "Index": ("index",),
+    "Middle": ("middle", "mid"),
+    "Ring": ("ring",),
+    "Pinky": ("pinky", "little", "small"),
+}
 _PHALANGES = {"metacarpal": 1, "proximal": 2, "intermediate": 3, "distal": 4}
 
 NEEDED = ("Hips", "LeftLeg", "RightLeg")
 """Without one leg at least nothing says how large the body is, and which way it stands."""
 
 _TEMPLATE = (
-    "Hips", "Neck1", "Head", *(f"{side}{part}" for side in ("Left", "Right") for part in (
-        "Shoulder", "Arm", "ForeArm", "Hand", "Leg", "Shin", "Foot", "ToeBase")),
-)  # fmt: skip
+    "Hips",
+    "Neck1",
+    "Head",
+    *(
+        f"{side}{part}"
+        for side in ("Left", "Right")
+        for part in ("Shoulder", "Arm", "ForeArm", "Hand", "Leg", "Shin", "Foot", "ToeBase")
+    ),
+)
 
 _MOST_BYTES = 1 << 20
 
@@ -74,11 +98,12 @@ def match_joints(
             found = match
     if "Hips" not in found or not {"LeftLeg", "RightLeg"} & set(found):
         raise InputError(
-            source, got=f"joints of unknown names: {', '.join(names[:12])}{' ...' if len(names) > 12 else ''}",
+            source,
+            got=f"joints of unknown names: {', '.join(names[:12])}{' ...' if len(names) > 12 else ''}",
             expected="Hips and legs under names of " + "; ".join(_names_of_tables()),
             fix="Write which is which into a file, as far as there are such joints, and pass mapping=FILE:\n"
             + json.dumps(_template(found, names), indent=1),
-        )  # fmt: skip
+        )
     return found
 
 
@@ -102,23 +127,39 @@ def read_mapping(path: str | Path) -> dict[str, str]:
     if not isinstance(found, dict) or not all(
         isinstance(text, str) for pair in found.items() for text in pair
     ):
-        raise InputError(str(path), got=type(found).__name__, expected="names, one for each joint here",
-                         fix="Write JOINT: NAME on each line.")  # fmt: skip
+        raise InputError(
+            str(path),
+            got=type(found).__name__,
+            expected="names, one for each joint here",
+            fix="Write JOINT: NAME on each line.",
+        )
     strange = sorted(set(found) - set(USER_JOINTS))
     if strange:
-        raise InputError(f"{path}: {strange[0]}", got="no joint of this skeleton", expected=", ".join(_TEMPLATE),
-                         fix="The joints of this skeleton stand before the colon.")  # fmt: skip
+        raise InputError(
+            f"{path}: {strange[0]}",
+            got="no joint of this skeleton",
+            expected=", ".join(_TEMPLATE),
+            fix="The joints of this skeleton stand before the colon.",
+        )
     return {target: name for target, name in found.items() if name}
 
 
 def _by_mapping(names: Sequence[str], mapping: Mapping[str, str], source: str) -> dict[str, int]:
     strange = [name for name in mapping.values() if name not in names]
     if strange:
-        raise InputError(f"mapping: {strange[0]}", got=f"no joint of {source}", expected=", ".join(names),
-                         fix="Correct the name in the mapping file.")  # fmt: skip
+        raise InputError(
+            f"mapping: {strange[0]}",
+            got=f"no joint of {source}",
+            expected=", ".join(names),
+            fix="Correct the name in the mapping file.",
+        )
     if "Hips" not in mapping or not {"LeftLeg", "RightLeg"} & set(mapping):
-        raise InputError("mapping", got=", ".join(mapping) or "no joints", expected="Hips, and LeftLeg or RightLeg",
-                         fix="Add them to the mapping file.")  # fmt: skip
+        raise InputError(
+            "mapping",
+            got=", ".join(mapping) or "no joints",
+            expected="Hips, and LeftLeg or RightLeg",
+            fix="Add them to the mapping file.",
+        )
     return {target: list(names).index(name) for target, name in mapping.items()}
 
 
@@ -148,10 +189,13 @@ def _entries(document: Mapping) -> Iterator[tuple[str, str]]:
                 yield name.replace("*", side), target.replace("*", side)
         templates = document["fingers"]
         for template in [templates] if isinstance(templates, str) else templates:
-            for finger, spellings in _FINGERS.items():
-                for spelling in spellings:
-                    stem = template.replace("*", side).replace("{finger}", spelling)
-                    yield from _phalanges(stem, side, finger, document["first"])
+            yield from _fingers(template.replace("*", side), side, document["first"])
+
+
+def _fingers(template: str, side: str, first: int) -> Iterator[tuple[str, str]]:
+    for finger, spellings in _FINGERS.items():
+        for spelling in spellings:
+            yield from _phalanges(template.replace("{finger}", spelling), side, finger, first)
 
 
 def _phalanges(stem: str, side: str, finger: str, first: int) -> Iterator[tuple[str, str]]:
@@ -171,7 +215,7 @@ def _phalanges(stem: str, side: str, finger: str, first: int) -> Iterator[tuple[
 
 
 def _key(name: str) -> str:
-    """A name without what differs between files: ``mixamorig:LeftUpLeg`` and ``up_leg.L`` are ``Leftupleg``."""
+    """A name without what differs between files: ``mixamorig:LeftUpLeg`` and ``up_leg.L`` are the same."""
     bare = re.split(r"[:|/]", name)[-1]
     tokens = [token.lower() for token in _TOKENS.findall(bare)]
     while len(tokens) > 1 and tokens[0] in _PREFIXES:

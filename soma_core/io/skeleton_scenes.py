@@ -28,7 +28,8 @@ _CHUNK = 1 << 20
 def read_glb_skeleton(path: Path, *, fps: float | None = None, root: str | None = None) -> SkeletonMotion:
     """Read the joints of the skins of a GLB or VRM; without a skin, all its nodes.
 
-    The rest pose is the one that the skin was bound in; for files of this project, that of the nodes, which is the T-pose.
+    The rest pose is the one that the skin was bound in; for files of this project,
+    that of the nodes, which is the T-pose.
     A VRM without animation is one frame.
 
     Raises:
@@ -104,9 +105,12 @@ def _under(
     weights = {top: {joint for joint in joints if top in _upwards(parents, joint)} for top in tops}
     large = [top for top, below in weights.items() if len(below) > 2] or list(weights)
     if len(large) != 1:
-        raise InputError(f"{path}: root", got=root or f"{len(large)} skeletons", expected="one of "
-                         + ", ".join(names[top] for top in large or sorted(joints)[:20]),
-                         fix="Pass root=NAME.")  # fmt: skip
+        raise InputError(
+            f"{path}: root",
+            got=root or f"{len(large)} skeletons",
+            expected="one of " + ", ".join(names[top] for top in large or sorted(joints)[:20]),
+            fix="Pass root=NAME.",
+        )
     return weights[large[0]]
 
 
@@ -204,8 +208,12 @@ def _usd(path: Path, fps: float | None, root: str | None) -> SkeletonMotion:
     found = [prim for prim in stage.Traverse() if prim.IsA(UsdSkel.Skeleton)]
     found = [prim for prim in found if root in (None, prim.GetName(), str(prim.GetPath()))] if root else found
     if len(found) != 1:
-        raise InputError(f"{path}: root", got=root or f"{len(found)} skeletons", expected="one: "
-                         + ", ".join(str(prim.GetPath()) for prim in found[:20]), fix="Pass root=NAME.")  # fmt: skip
+        raise InputError(
+            f"{path}: root",
+            got=root or f"{len(found)} skeletons",
+            expected="one: " + ", ".join(str(prim.GetPath()) for prim in found[:20]),
+            fix="Pass root=NAME.",
+        )
     query = _skeleton_query(stage, found[0])
     paths = [str(joint) for joint in query.GetJointOrder()]
     names = [joint.rpartition("/")[2] for joint in paths]
@@ -247,7 +255,7 @@ def _skeleton_query(stage: Any, prim: Any) -> Any:
 
 
 def _usd_rest(query: Any, first: np.ndarray, body: np.ndarray, names: Sequence[str]) -> np.ndarray:
-    """Rest transforms: the rest pose of our own skeletons, which is the T-pose; else where the skin was bound."""
+    """Rest transforms: the rest pose of our own skeletons, a T-pose; else where the skin was bound."""
     own = {"LeftForeArm", "LeftShin"} <= {*names} & {*USER_JOINTS}
     bound: Callable[[], Any] = query.GetJointWorldBindTransforms
     if query.HasBindPose() and not (own and query.HasRestPose()):
@@ -255,6 +263,6 @@ def _usd_rest(query: Any, first: np.ndarray, body: np.ndarray, names: Sequence[s
     if query.HasRestPose():
         from pxr import Usd
 
-        rest = query.ComputeJointSkelTransforms(Usd.TimeCode.Default(), True)
+        rest = query.ComputeJointSkelTransforms(Usd.TimeCode.Default(), atRest=True)
         return body @ np.swapaxes(np.array(rest), -1, -2)
     return first.copy()

@@ -15,20 +15,28 @@ __all__ = ["smpl_skeleton"]
 
 _BODY: Final[dict[str, tuple[str, tuple[float, float, float]]]] = {
     "pelvis": ("", (0, -0.22, 0.03)),
-    "left_hip": ("pelvis", (0.07, -0.31, 0.02)), "right_hip": ("pelvis", (-0.07, -0.31, 0.02)),
+    "left_hip": ("pelvis", (0.07, -0.31, 0.02)),
+    "right_hip": ("pelvis", (-0.07, -0.31, 0.02)),
     "spine1": ("pelvis", (0, -0.11, 0.00)),
-    "left_knee": ("left_hip", (0.10, -0.69, 0.02)), "right_knee": ("right_hip", (-0.10, -0.69, 0.02)),
+    "left_knee": ("left_hip", (0.10, -0.69, 0.02)),
+    "right_knee": ("right_hip", (-0.10, -0.69, 0.02)),
     "spine2": ("spine1", (0, 0.02, 0.00)),
-    "left_ankle": ("left_knee", (0.09, -1.09, -0.03)), "right_ankle": ("right_knee", (-0.09, -1.09, -0.03)),
+    "left_ankle": ("left_knee", (0.09, -1.09, -0.03)),
+    "right_ankle": ("right_knee", (-0.09, -1.09, -0.03)),
     "spine3": ("spine2", (0, 0.07, 0.03)),
-    "left_foot": ("left_ankle", (0.12, -1.15, 0.09)), "right_foot": ("right_ankle", (-0.12, -1.15, 0.09)),
+    "left_foot": ("left_ankle", (0.12, -1.15, 0.09)),
+    "right_foot": ("right_ankle", (-0.12, -1.15, 0.09)),
     "neck": ("spine3", (0, 0.28, -0.02)),
-    "left_collar": ("spine3", (0.08, 0.19, -0.01)), "right_collar": ("spine3", (-0.08, 0.19, -0.01)),
+    "left_collar": ("spine3", (0.08, 0.19, -0.01)),
+    "right_collar": ("spine3", (-0.08, 0.19, -0.01)),
     "head": ("neck", (0, 0.36, 0.03)),
-    "left_shoulder": ("left_collar", (0.17, 0.22, -0.02)), "right_shoulder": ("right_collar", (-0.17, 0.22, -0.02)),
-    "left_elbow": ("left_shoulder", (0.43, 0.21, -0.04)), "right_elbow": ("right_shoulder", (-0.43, 0.21, -0.04)),
-    "left_wrist": ("left_elbow", (0.68, 0.22, -0.05)), "right_wrist": ("right_elbow", (-0.68, 0.22, -0.05)),
-}  # fmt: skip
+    "left_shoulder": ("left_collar", (0.17, 0.22, -0.02)),
+    "right_shoulder": ("right_collar", (-0.17, 0.22, -0.02)),
+    "left_elbow": ("left_shoulder", (0.43, 0.21, -0.04)),
+    "right_elbow": ("right_shoulder", (-0.43, 0.21, -0.04)),
+    "left_wrist": ("left_elbow", (0.68, 0.22, -0.05)),
+    "right_wrist": ("right_elbow", (-0.68, 0.22, -0.05)),
+}
 """Joints in the order of SMPL, their parents, and where they stand on an average adult [m]."""
 
 _FINGERS = ("index", "middle", "pinky", "ring", "thumb")
@@ -38,7 +46,7 @@ _FACE = ("jaw", "left_eye", "right_eye")
 def smpl_skeleton(motion: SmplMotion, rig: Rig) -> SkeletonMotion:
     """Joints of a motion of SMPL, SMPL-H or SMPL-X on an average adult; betas are not read.
 
-    Fingers and face, whose places follow from the model alone, rest here as those of the canonical rig do. The
+    Fingers and face, whose places follow from the model alone, rest as those of the canonical rig do. The
     two hand joints of SMPL, which lie on the palm, are left out.
 
     Args:
@@ -66,7 +74,13 @@ def smpl_skeleton(motion: SmplMotion, rig: Rig) -> SkeletonMotion:
     vectors = motion.rotations[:, : len(names)].astype(np.float64)
     rotations = Rotation.from_rotvec(vectors.reshape(-1, 3)).as_matrix().reshape(*vectors.shape, 3)
     return SkeletonMotion(
-        names=tuple(names), parents=np.array(parents), rest=np.array(rest), rotations=rotations,
-        root=motion.translation.astype(np.float64) + rest[0], fps=motion.fps, up=motion.up, metres=1.0,
+        names=tuple(names),
+        parents=np.array(parents),
+        rest=np.array(rest),
+        rotations=rotations,
+        root=motion.translation.astype(np.float64) + rest[0],
+        fps=motion.fps,
+        up=motion.up,
+        metres=1.0,
         source=motion.source,
-    )  # fmt: skip
+    )

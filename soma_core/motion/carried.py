@@ -37,14 +37,20 @@ def check_carried(path: Path, layout: str, options: ConvertOptions) -> None:
     joints = skeleton or (layout in SMPL_LAYOUTS and options.carry == "skeleton")
     unused = {
         "carry": options.carry if options.carry != "fit" and layout not in SMPL_LAYOUTS else None,
-        "mapping": None if skeleton else options.mapping, "root": None if skeleton else options.root,
+        "mapping": None if skeleton else options.mapping,
+        "root": None if skeleton else options.root,
         "match": None if joints else options.match,
-        "gender": options.gender if skeleton else None, "most_betas": options.most_betas if joints else None,
-    }  # fmt: skip
+        "gender": options.gender if skeleton else None,
+        "most_betas": options.most_betas if joints else None,
+    }
     for name, value in unused.items():
         if value is not None:
-            raise InputError(name, got=str(value), expected=f"none for {path.name}, whose layout is {layout}",
-                             fix=f"Leave {name} out.")  # fmt: skip
+            raise InputError(
+                name,
+                got=str(value),
+                expected=f"none for {path.name}, whose layout is {layout}",
+                fix=f"Leave {name} out.",
+            )
 
 
 def carried(path: Path, layout: str, options: ConvertOptions) -> Retargeted:
@@ -61,14 +67,24 @@ def carried(path: Path, layout: str, options: ConvertOptions) -> Retargeted:
     else:
         source = read_skeleton(path, fps=options.fps, root=options.root)
     mapping = read_mapping(options.mapping) if options.mapping else None
-    found = retarget(source, mapping=mapping, unit=str(options.unit) if options.unit else None, up=up,
-                     match=str(match or BoneMatch.bones))  # fmt: skip
+    found = retarget(
+        source,
+        mapping=mapping,
+        unit=str(options.unit) if options.unit else None,
+        up=up,
+        match=str(match or BoneMatch.bones),
+    )
     left = found.report["not_carried"]
     if left:
         more = " ..." if len(left) > _SHOWN else ""
         _log.info("%s: not carried over: %s%s", path.name, ", ".join(left[:_SHOWN]), more)
     scale = found.report["path_scale"]
     if scale != 1:
-        _log.info("%s: its legs are %.3f m; the path is scaled by %.3f to those of the rig, %.3f m",
-                  path.name, found.report["legs_metres"], scale, scale * found.report["legs_metres"])  # fmt: skip
+        _log.info(
+            "%s: its legs are %.3f m; the path is scaled by %.3f to those of the rig, %.3f m",
+            path.name,
+            found.report["legs_metres"],
+            scale,
+            scale * found.report["legs_metres"],
+        )
     return found

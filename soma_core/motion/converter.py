@@ -210,8 +210,7 @@ def _known_layout(path: Path) -> Layout:
         raise InputError(
             str(path),
             got="no motion under any key that is known",
-            expected="the keys of a file of the SMPL family, SAM 3D Body, kimodo or SOMA, or a skeleton as BVH, GLB "
-            "or USD",
+            expected="a file of the SMPL family, SAM 3D Body, kimodo or SOMA, or a skeleton (BVH, GLB, USD)",
             fix="Vertices over time are what soma invert takes.",
         )
     return layout

@@ -1,45 +1,22 @@
-"""The rest pose of another skeleton against the T-pose of this one: size, axes, and a turn for each joint."""
+"""The rest pose of another skeleton against the T-pose of this one: a turn for each joint."""
 
 from __future__ import annotations
 
 import itertools
-import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
-from soma_core.errors import InputError
 from soma_core.io.joint_order import PARENT_NAMES, USER_JOINTS
-from soma_core.io.skeleton_motion import SkeletonMotion
+from soma_core.motion.source_skeleton import Placed, legs_and_trunk, tail, unit_vector
 from soma_core.rig.skeleton import Rig
-from soma_core.topology.frames import METRES
 
-__all__ = ["Alignment", "Placed", "align", "chains", "own_alignment", "placed", "tail"]
-
-_log = logging.getLogger(__name__)
-
-_UNITS = (
-    *((name, metres, 0.55, 1.4) for name, metres in METRES.items()),
-    ("inches", 0.0254, 0.7, 1.05),
-    ("units of 56 mm, as CMU's", 0.0254 / 0.45, 0.7, 1.05),
-    *((name, metres, 0.2, 2.0) for name, metres in METRES.items()),
-)
-"""Units and the legs, thigh and shin, that speak for them [m]; the first that fits is taken.
-
-Children under six in centimetres have legs like adults in inches, which are more."""
-
-_ANY_LEGS = (0.15, 2.0)
-"""Legs [m] that leave a unit standing which the file tells."""
-
-_STANDING = 0.5
-"""Cosine under which legs at rest do not hang below a trunk: the pose is none of a human."""
+__all__ = ["Alignment", "align", "own_alignment"]
 
 _BENT = 0.1
 """Mean sine of the bend of a knee or elbow that tells its axis."""
-
-_UPRIGHT = 0.7
-"""Cosine between the mean direction of trunks and an axis that they are said to stand along."""
 
 _CLOSE = np.cos(np.radians(15))
 _SAME_POSE = np.cos(np.radians(5))
@@ -53,31 +30,6 @@ _NEXT = {
     "Foot": "ToeBase",
 }
 _KNUCKLES = ("Middle2", "Index2", "Ring2", "Pinky2")
-_AXES = {
-    "+y": np.eye(3), "-y": np.diag([1.0, -1, -1]), "+z": np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]]),
-    "-z": np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]]), "+x": np.array([[0, -1.0, 0], [1, 0, 0], [0, 0, 1]]),
-    "-x": np.array([[0, 1.0, 0], [-1, 0, 0], [0, 0, 1]]),
-}  # fmt: skip
-"""Turns that bring an upward axis to +y."""
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Placed:
-    """A source in metres and with +Y up.
-
-    Attributes:
-        source: the motion.
-        metres: length of its unit.
-        up: its upward axis as it was.
-        turn: (3, 3) that brought it upright.
-        standing: whether its rest pose is one of a human.
-    """
-
-    source: SkeletonMotion
-    metres: float
-    up: str
-    turn: np.ndarray
-    standing: bool
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -99,136 +51,6 @@ class Alignment:
         return [self.along[joint] for joint in joints]
 
 
-def chains(source: SkeletonMotion, match: dict[str, int]) -> tuple[list[int], list[int]]:
-    """Joints of spine and neck, told by their place between Hips, shoulders and head.
-
-    Neck1 is taken out of `match`: it is the first of the neck.
-    """
-    hips, first = match["Hips"], match.pop("Neck1", None)
-    arms = [joint for side in ("Left", "Right")
-            if (joint := match.get(f"{side}Shoulder", match.get(f"{side}Arm"))) is not None]  # fmt: skip
-    ways = [_way(source.parents, hips, joint) for joint in arms]
-    top = match.get("Head", first)
-    if top is None:
-        shared = [joint for joint in (ways[0] if ways else []) if all(joint in way for way in ways)]
-        return shared, []
-    way = _way(source.parents, hips, top) + ([top] if top == first else [])
-    if first in way:
-        cut = way.index(first)
-    else:
-        cut = max(
-            (way.index(joint) + 1 for other in ways for joint in other if joint in way), default=len(way)
-        )
-    return way[:cut], way[cut:]
-
-
-def _way(parents: np.ndarray, above: int, joint: int) -> list[int]:
-    """Joints between two of one chain, from the upper one down."""
-    found: list[int] = []
-    parent = int(parents[joint])
-    while parent >= 0 and parent != above:
-        found.append(parent)
-        parent = int(parents[parent])
-    return found[::-1] if parent == above else []
-
-
-def tail(source: SkeletonMotion, joint: int) -> np.ndarray | None:
-    """From a joint to the end of its bone at rest, where the file or its only child tells."""
-    if source.ends is not None and np.isfinite(source.ends[joint]).all() and np.any(source.ends[joint]):
-        return np.asarray(source.ends[joint])
-    children = np.flatnonzero(source.parents == joint)
-    return source.rest[children[0]] - source.rest[joint] if len(children) == 1 else None
-
-
-def placed(source: SkeletonMotion, match: Mapping[str, int], *, unit: str | None, up: str | None) -> Placed:
-    """Bring a source to metres and upright.
-
-    Raises:
-        InputError: a size that fits no unit.
-    """
-    metres = METRES[unit] if unit in METRES else _metres(source, match)  # type: ignore[index]
-    legs, trunk = _legs_and_trunk(source, match)
-    standing = bool(np.all(legs @ trunk < -_STANDING))
-    up = up or source.up
-    if up is None:
-        rising = trunk - legs.mean(axis=0) if standing else _mean_trunk(source, match)
-        axis = int(np.abs(rising).argmax())
-        up = ("+" if rising[axis] > 0 else "-") + "xyz"[axis]
-    up = up if up[0] in "+-" else f"+{up}"
-    turn = _AXES[up]
-    _warn_lying(source, turn @ _unit(_mean_trunk(source, match)), turn)
-    return Placed(
-        source=source.placed(turn, metres, "+y"), metres=metres, up=up, turn=turn, standing=standing
-    )
-
-
-def _legs_and_trunk(source: SkeletonMotion, match: Mapping[str, int]) -> tuple[np.ndarray, np.ndarray]:
-    """Directions of the thighs (1 or 2, 3), and from the legs to head and arms, at rest."""
-    thighs = []
-    for side in ("Left", "Right"):
-        if f"{side}Leg" in match:
-            joint, shin = match[f"{side}Leg"], match.get(f"{side}Shin")
-            bone = source.rest[shin] - source.rest[joint] if shin is not None else tail(source, joint)
-            thighs.append(np.zeros(3) if bone is None else _unit(bone))
-    legs = np.array(thighs)
-    tops = [source.rest[match[f"{side}Leg"]] for side in ("Left", "Right") if f"{side}Leg" in match]
-    high = [source.rest[match[name]] for name in ("Head", "LeftArm", "RightArm") if name in match]
-    return legs, _unit(np.mean(high, axis=0) - np.mean(tops, axis=0)) if high else -legs.mean(axis=0)
-
-
-def _mean_trunk(source: SkeletonMotion, match: Mapping[str, int]) -> np.ndarray:
-    """Where the trunk rises to on average over some frames."""
-    step = max(source.frame_count // 100, 1)
-    high = [match[name] for name in ("Head", "LeftArm", "RightArm") if name in match]
-    low = [match[name] for name in ("LeftFoot", "RightFoot", "LeftShin", "RightShin") if name in match]
-    positions = source.positions()[::step]
-    begin = positions[:, low].mean(axis=1) if low else positions[:, match["Hips"]]
-    end = positions[:, high].mean(axis=1) if high else positions[:, match["Hips"]]
-    return np.asarray((end - begin).mean(axis=0))
-
-
-def _warn_lying(source: SkeletonMotion, rising: np.ndarray, turn: np.ndarray) -> None:
-    """Say so where trunks stand along another axis than the world is taken to have."""
-    axis = int(np.abs(rising).argmax())
-    if abs(rising[axis]) < _UPRIGHT or (axis == 1 and rising[1] > 0):
-        return
-    stands = turn.T @ (np.sign(rising[axis]) * np.eye(3)[axis])
-    place = int(np.abs(stands).argmax())
-    _log.warning("%s: the body %s in most frames; if not so, pass up=%s%s", source.source,
-                 "is upside down" if axis == 1 else "lies", "" if stands[place] > 0 else "-", "xyz"[place])  # fmt: skip
-
-
-def _unit(vector: np.ndarray) -> np.ndarray:
-    return np.asarray(vector / max(float(np.linalg.norm(vector)), 1e-12))
-
-
-def _metres(source: SkeletonMotion, match: Mapping[str, int]) -> float:
-    """Length of the unit, told by the legs."""
-    lengths = []
-    for side in ("Left", "Right"):
-        joints = [match[side + part] for part in ("Leg", "Shin", "Foot") if side + part in match]
-        if not joints:
-            continue
-        bones = np.linalg.norm(np.diff(source.rest[joints], axis=0), axis=1)
-        end = tail(source, joints[-1])
-        known = len(bones) == 2
-        lengths.append(bones.sum() if known or end is None else 2 * np.linalg.norm(end) if not len(bones)
-                       else bones.sum() + np.linalg.norm(end))  # fmt: skip
-    legs = float(np.mean(lengths))
-    if source.metres is not None and _ANY_LEGS[0] <= legs * source.metres <= _ANY_LEGS[1]:
-        return source.metres
-    for name, metres, least, most in _UNITS:
-        if least <= legs * metres <= most:
-            usual = name in METRES and source.metres is None
-            _log.log(logging.INFO if usual else logging.WARNING, "%s: legs of %.3g are read as %s, %.2f m; unit= says another",
-                     source.source, legs, name, legs * metres)  # fmt: skip
-            return metres
-    raise InputError(
-        f"{source.source}: unit", got=f"legs of {legs:.3g}",
-        expected=f"{_ANY_LEGS[0]} to {_ANY_LEGS[1]} m in m, cm, mm or inches", fix="Pass unit=m, cm or mm.",
-    )  # fmt: skip
-
-
 def own_alignment(
     found: Placed, match: Mapping[str, int], spine: Sequence[int], neck: Sequence[int], rig: Rig
 ) -> Alignment | None:
@@ -240,8 +62,11 @@ def own_alignment(
     joints = {name: place for place, name in enumerate(source.names) if name in USER_JOINTS}
     orient, bind = rig.t_pose_world[:, :3, :3], rig.bind_world[:, :3, :3]
     back = np.swapaxes(orient, -1, -2)
-    poses = {"T-pose": np.broadcast_to(np.eye(3), orient.shape), "bind pose": bind @ back,
-             "axes of the joints": found.turn @ back}  # fmt: skip
+    poses = {
+        "T-pose": np.broadcast_to(np.eye(3), orient.shape),
+        "bind pose": bind @ back,
+        "axes of the joints": found.turn @ back,
+    }
     index = {name: place for place, name in enumerate(rig.joint_names)}
     bones = [(name, above) for name in joints if (above := PARENT_NAMES[name]) in joints]
     at = np.array([[joints[name], joints[above]] for name, above in bones]).reshape(-1, 2)
@@ -249,8 +74,10 @@ def own_alignment(
     own = np.array([[index[name], index[above]] for name, above in bones]).reshape(-1, 2)
     here = rig.t_pose_world[own[:, 0], :3, 3] - rig.t_pose_world[own[:, 1], :3, 3]
     for kind, turns in poses.items():
-        cosines = [_unit(turns[above] @ bone) @ _unit(other)
-                   for (_, above), bone, other in zip(own, here, there, strict=True)]  # fmt: skip
+        cosines = [
+            unit_vector(turns[above] @ bone) @ unit_vector(other)
+            for (_, above), bone, other in zip(own, here, there, strict=True)
+        ]
         if len(bones) and np.median(cosines) > _SAME_POSE:
             along = {joint: turns[index[source.names[joint]]] for joint in (*spine, *neck)}
             return Alignment(turns={name: turns[index[name]] for name in match}, along=along, kind=kind)
@@ -318,11 +145,11 @@ class _Aligner:
         legs = {side: rest[match[f"{side}Leg"]] for side in ("Left", "Right") if f"{side}Leg" in match}
         middle = legs["Left"] + legs["Right"] if len(legs) == 2 else 2 * rest[match["Hips"]]
         left = legs.get("Left", middle / 2) - legs.get("Right", middle / 2)
-        thigh, trunk = _legs_and_trunk(self._source, match)
+        thigh, trunk = legs_and_trunk(self._source, match)
         up = trunk - thigh.mean(axis=0)
         if not self._standing and spine:
             up = rest[spine[0]] - middle / 2
-        left, up = _unit(left), _unit(up)
+        left, up = unit_vector(left), unit_vector(up)
         return max(_quarter_turns(), key=lambda turn: 2 * turn[:, 0] @ left + turn[:, 1] @ up)
 
     def _chain(
@@ -344,18 +171,24 @@ class _Aligner:
         return above
 
     def _turned(
-        self, turn: np.ndarray, bone: np.ndarray, there: np.ndarray | None, above: int, joint: int,
-        *, parent_turn: np.ndarray,
-    ) -> np.ndarray:  # fmt: skip
-        """Turn a bone here the shortest way to that there; without a human rest pose, the twist by quarters."""
+        self,
+        turn: np.ndarray,
+        bone: np.ndarray,
+        there: np.ndarray | None,
+        above: int,
+        joint: int,
+        *,
+        parent_turn: np.ndarray,
+    ) -> np.ndarray:
+        """Turn a bone here the shortest way to that there; the twist by quarters, unless it rests upright."""
         if there is None or not np.any(there):
             return turn
         turn = _shortest(turn @ bone, there) @ turn
         if self._standing:
             return turn
         between = np.swapaxes(self._turns[:, above] @ parent_turn, -1, -2) @ self._turns[:, joint] @ turn
-        quarter = np.round(_twist(between.mean(axis=0), _unit(bone)) / (np.pi / 2)) * np.pi / 2
-        return np.asarray(turn @ _about(_unit(bone), -quarter))
+        quarter = np.round(_twist(between.mean(axis=0), unit_vector(bone)) / (np.pi / 2)) * np.pi / 2
+        return np.asarray(turn @ _about(unit_vector(bone), -quarter))
 
     def _joint(self, name: str, chest: int) -> np.ndarray:
         """Turn of a joint of limbs, hands or head."""
@@ -373,7 +206,7 @@ class _Aligner:
             return turn
         hinge = None if self._standing else self._hinge(name)
         if hinge is not None:
-            return _frame(_unit(bones[1]), hinge[1]) @ _frame(_unit(bones[0]), hinge[0]).T
+            return _frame(unit_vector(bones[1]), hinge[1]) @ _frame(unit_vector(bones[0]), hinge[0]).T
         return self._turned(turn, bones[0], bones[1], above, self._match[name], parent_turn=turn)
 
     def _head(self, above: int, turn: np.ndarray) -> np.ndarray:
@@ -405,13 +238,13 @@ class _Aligner:
         between = (
             np.swapaxes(self._turns[:, self._match[first]], -1, -2) @ self._turns[:, self._match[second]]
         )
-        axis = np.cross(_unit(bones[0][1]), between @ _unit(bones[1][1]))
+        axis = np.cross(unit_vector(bones[0][1]), between @ unit_vector(bones[1][1]))
         if name == second:
             axis = (np.swapaxes(between, -1, -2) @ axis[..., None])[..., 0]
         mean = axis.mean(axis=0)
         if np.linalg.norm(mean) < _BENT:
             return None
-        there = _unit(mean)
+        there = unit_vector(mean)
         nearest = np.sign(there) * (np.abs(there) == np.abs(there).max())
         here = np.array([1.0, 0, 0]) if upper == "Leg" else np.array([0, -1.0 if side == "Left" else 1.0, 0])
         return here, nearest if there @ nearest > _CLOSE else there
@@ -441,24 +274,26 @@ def _quarter_turns() -> list[np.ndarray]:
 
 def _frame(first: np.ndarray, second: np.ndarray) -> np.ndarray:
     """Axes (3, 3) in columns: the first direction, what is left of the second, and the third."""
-    across = _unit(second - (second @ first) * first)
+    across = unit_vector(second - (second @ first) * first)
     return np.stack([first, across, np.cross(first, across)], -1)
 
 
 def _about(axis: np.ndarray, angle: float) -> np.ndarray:
-    from scipy.spatial.transform import Rotation
-
     return np.asarray(Rotation.from_rotvec(angle * axis).as_matrix())
 
 
 def _shortest(first: np.ndarray, second: np.ndarray) -> np.ndarray:
     """The smallest rotation from one direction to another; half a turn goes about the most upright axis."""
-    a, b = _unit(first), _unit(second)
+    a, b = unit_vector(first), unit_vector(second)
     axis, cosine = np.cross(a, b), float(a @ b)
     if cosine < -0.9999:
         side = np.eye(3)[np.abs(a).argmin()]
-        return _about(_unit(np.cross(a, side)), np.pi)
-    return _about(_unit(axis), float(np.arctan2(np.linalg.norm(axis), cosine))) if np.any(axis) else np.eye(3)
+        return _about(unit_vector(np.cross(a, side)), np.pi)
+    return (
+        _about(unit_vector(axis), float(np.arctan2(np.linalg.norm(axis), cosine)))
+        if np.any(axis)
+        else np.eye(3)
+    )
 
 
 def _twist(matrix: np.ndarray, axis: np.ndarray) -> float:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -14,7 +14,8 @@ from soma_core.io.joint_names import match_joints
 from soma_core.io.joint_order import PARENT_NAMES, USER_JOINTS
 from soma_core.io.motion import Motion
 from soma_core.io.skeleton_motion import SkeletonMotion
-from soma_core.motion.rest_poses import align, chains, own_alignment, placed
+from soma_core.motion.rest_poses import align, own_alignment
+from soma_core.motion.source_skeleton import chains, placed
 from soma_core.rig import load_canonical
 
 __all__ = ["Retargeted", "retarget"]
@@ -46,10 +47,10 @@ def retarget(
     """Carry the motion of another skeleton over to this one.
 
     A joint keeps its change of world orientation since the rest pose, after the rest poses are brought
-    together: each bone of this skeleton is first turned, from where its parent's bone went, by the shortest way
-    to the direction of the other's bone at rest, so that bones point the same way in every frame. Where a rest
-    pose is no human pose (all bones along one axis), the twist about a bone comes from the bends of knees and
-    elbows. Spines of another number of joints share out their turn; joints without a counterpart stay at rest.
+    together: each bone of this skeleton is first turned, from where its parent's went, by the shortest way to
+    the direction of the other's bone at rest, so that bones point the same way in every frame. Where a
+    rest pose is no human pose (all bones along one axis), the twist about a bone comes from the bends of
+    knees and elbows. Spines of another number of joints share out their turn; others stay at rest.
 
     The path is scaled by the length of the legs, so that feet reach the ground on the rig's own body; motions
     under this skeleton's own names keep theirs.
@@ -83,19 +84,31 @@ def retarget(
     rotations = _local(goals, source.frame_count)
     path, scale, legs = _path(source, joints, turns, goals["Hips"], rest, carried=bool(own))
     motion = Motion(
-        rotations=rotations, translation=path, fps=source.fps, joint_names=USER_JOINTS, rig_revision=rig.revision,
+        rotations=rotations,
+        translation=path,
+        fps=source.fps,
+        joint_names=USER_JOINTS,
+        rig_revision=rig.revision,
         source=source.source,
-    )  # fmt: skip
-    named = {name: source.names[joint] for name, joint in joints.items()}
-    used = {*joints.values(), *spine, *neck}
-    report = {
-        "joints": named, "spine": [source.names[joint] for joint in spine],
-        "neck": [source.names[joint] for joint in neck], "rest_pose": alignment.kind, "unit_metres": found.metres,
-        "up": found.up, "legs_metres": legs, "path_scale": scale,
-        "not_carried": [name for joint, name in enumerate(source.names) if joint not in used],
-        "at_rest": [name for name in USER_JOINTS if name not in goals],
+    )
+    report = _joints_report(source, joints, spine, neck) | {
+        "rest_pose": alignment.kind, "unit_metres": found.metres, "up": found.up, "legs_metres": legs,
+        "path_scale": scale, "at_rest": [name for name in USER_JOINTS if name not in goals],
     }  # fmt: skip
     return Retargeted(motion=motion, report=report)
+
+
+def _joints_report(
+    source: SkeletonMotion, joints: Mapping[str, int], spine: Sequence[int], neck: Sequence[int]
+) -> dict[str, Any]:
+    """Which joint became which, and which were left."""
+    used = {*joints.values(), *spine, *neck}
+    return {
+        "joints": {name: source.names[joint] for name, joint in joints.items()},
+        "spine": [source.names[joint] for joint in spine],
+        "neck": [source.names[joint] for joint in neck],
+        "not_carried": [name for joint, name in enumerate(source.names) if joint not in used],
+    }
 
 
 def _spread(
@@ -158,8 +171,10 @@ def _path(
     if carried or len(sides) < 1:
         return place, 1.0, _length(source.rest, joints) if joints else None
     legs = _length(source.rest, joints)
-    own = _length(np.array([rest[side + part] for side in sides for part in ("Leg", "Shin", "Foot")]),
-                  [[3 * k, 3 * k + 1, 3 * k + 2] for k in range(len(sides))])  # fmt: skip
+    own = _length(
+        np.array([rest[side + part] for side in sides for part in ("Leg", "Shin", "Foot")]),
+        [[3 * k, 3 * k + 1, 3 * k + 2] for k in range(len(sides))],
+    )
     if len(sides) < 2:
         return own / legs * place, own / legs, legs
     middle = positions[:, [chain[0] for chain in joints]].mean(axis=1)

@@ -223,8 +223,9 @@ def _usd(path: Path) -> None:
 
 
 def _bvh(path: Path) -> None:
-    head = "HIERARCHY\nROOT Hips\n{\n OFFSET 0 0 0\n CHANNELS 6 Xposition Yposition Zposition Zrotation Yrotation "
-    leg = "Xrotation\n JOINT LeftLeg\n {\n  OFFSET 0 -40 0\n  CHANNELS 1 Xrotation\n  End Site\n  {\n   OFFSET 0 -40 0\n  }"
+    head = "HIERARCHY\nROOT Hips\n{\n OFFSET 0 0 0\n CHANNELS 6 Xposition Yposition Zposition "
+    leg = "Zrotation Yrotation Xrotation\n JOINT LeftLeg\n {\n  OFFSET 0 -40 0\n  CHANNELS 1 Xrotation\n"
+    leg += "  End Site\n  {\n   OFFSET 0 -40 0\n  }"
     path.write_text(f"{head}{leg}\n }}\n}}\nMOTION\nFrames: 2\nFrame Time: 0.04\n" + "0 90 0 1 2 3 4\n" * 2)
 
 
@@ -274,7 +275,8 @@ READERS = [
         name="vertices usd", suffix=".usda", read=_frames, good=_usd,
         accepts=(
             "usda of a repeated joint", "usda of faces out of range", "usda of negative faces",
-            "usda of negative face counts", "usda of weights of NaN", "usda of points of NaN",
+            "usda of negative face counts",
+            "usda of weights of NaN", "usda of points of NaN",
         ),
     ),
     Reader(name="vertices usdc", suffix=".usdc", read=_frames),
@@ -285,8 +287,9 @@ READERS = [
     Reader(
         name="joints of a usd", suffix=".usda", read=read_skeleton, good=_usd,
         accepts=(
-            "usda of joint indices out of range", "usda of negative joint indices", "usda of faces out of range",
-            "usda of negative faces", "usda of negative face counts", "usda of weights of NaN",
+            "usda of joint indices out of range", "usda of negative joint indices",
+            "usda of faces out of range", "usda of negative faces",
+            "usda of negative face counts", "usda of weights of NaN",
             "usda of points of NaN", "usda of a huge element size", "usda of an element size of zero",
         ),
     ),

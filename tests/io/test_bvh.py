@@ -123,8 +123,13 @@ def test_what_tools_write_differently_is_read(tmp_path):
     assert np.array_equal(lines.rotations, plain.rotations)
     noted = read_bvh(written(tmp_path / "c.bvh", "# a note\n" + row + "// another\n" + row))
     assert np.array_equal(noted.rotations, plain.rotations)
-    swapped = read_bvh(written(tmp_path / "d.bvh", 2 * "30 2 20 90 10 1 40\n",
-                               root="CHANNELS 6 Xrotation Zposition Yrotation Yposition Zrotation Xposition"))  # fmt: skip
+    swapped = read_bvh(
+        written(
+            tmp_path / "d.bvh",
+            2 * "30 2 20 90 10 1 40\n",
+            root="CHANNELS 6 Xrotation Zposition Yrotation Yposition Zrotation Xposition",
+        )
+    )
     assert swapped.root[0].tolist() == [1, 90, 2]
     assert (
         np.abs(

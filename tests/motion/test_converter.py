@@ -10,9 +10,10 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from soma_core import SomaLayer
+from soma_core import SomaLayer, load_canonical
 from soma_core.errors import InputError
 from soma_core.io import USER_JOINTS, Motion, read_motion, write_motion
+from soma_core.io.skeleton_motion import soma_skeleton
 from soma_core.motion import ConvertOptions, convert_file, converter, fit_job, layout_of
 from soma_core.plugin.errors import BackendError
 from soma_core.plugin.registry import default_registry
@@ -20,6 +21,9 @@ from tests.motion.conftest import AMASS_FRAMES
 
 FIT_MM = 3.0
 """Mean distance of a fit to the stand-in, whose pose blend shapes are noise of about that size."""
+
+CARRIED_DEGREES = 15.0
+"""Mean angle of a limb that is carried over to the same limb fitted: what the rest poses leave open."""
 
 Z_UP_TO_Y_UP = np.array([[1, 0, 0], [0, 0, 1], [0, -1, 0]])
 
@@ -196,3 +200,26 @@ def test_a_file_without_a_motion_is_refused(tmp_path):
     np.savez(tmp_path / "shape.npz", betas=np.zeros(16))
     with pytest.raises(InputError, match=r"shape\.npz: got no motion under any key that is known"):
         converted(tmp_path / "shape.npz", tmp_path / "out")
+
+
+def test_without_the_model_the_joints_are_carried_over(
+    smplh_models, amass_file, tmp_path, monkeypatch, caplog
+):
+    fitted = converted(amass_file, tmp_path / "fitted", chunk=4).motion()
+    monkeypatch.setenv("SOMA_DATA_DIR", str(tmp_path / "no models"))
+    with pytest.raises(BackendError, match="Or pass carry=skeleton"):
+        converted(amass_file, tmp_path / "none")
+    carried = converted(amass_file, tmp_path / "carried", carry="skeleton").motion()
+    assert "betas are not read" in caplog.text
+    worlds = []
+    for each in (fitted, carried):
+        skeleton = soma_skeleton(each, load_canonical("low")[1])
+        worlds.append(skeleton.turns())
+    cosine = (np.einsum("fjab,fjab->fj", *worlds) - 1) / 2
+    apart = np.degrees(np.arccos(cosine.clip(-1, 1))).mean(0)
+    limbs = [
+        USER_JOINTS.index(side + part)
+        for side in ("Left", "Right")
+        for part in ("Arm", "ForeArm", "Leg", "Shin")
+    ]
+    assert apart[limbs].max() < CARRIED_DEGREES

@@ -22,26 +22,67 @@ from tests.skeletons import along_axes, biped, in_another_pose, moved
 SAME_DEGREES = 0.05  # float32 rotations and seven decimals of a file; half a degree is what is asked
 
 LAFAN = {
-    "hips": "Hips", "spine": "Spine Spine1 Spine2", "neck": "Neck", "head": "Head", "collar": "*Shoulder", "arm": "*Arm",
-    "elbow": "*ForeArm", "wrist": "*Hand", "thigh": "*UpLeg", "knee": "*Leg", "ankle": "*Foot", "toe": "*Toe",
-    "finger1": "*HandMiddle1", "finger2": "*HandMiddle2",
-}  # fmt: skip
+    "hips": "Hips",
+    "spine": "Spine Spine1 Spine2",
+    "neck": "Neck",
+    "head": "Head",
+    "collar": "*Shoulder",
+    "arm": "*Arm",
+    "elbow": "*ForeArm",
+    "wrist": "*Hand",
+    "thigh": "*UpLeg",
+    "knee": "*Leg",
+    "ankle": "*Foot",
+    "toe": "*Toe",
+    "finger1": "*HandMiddle1",
+    "finger2": "*HandMiddle2",
+}
 MIXAMO = {part: " ".join(f"mixamorig:{name}" for name in names.split()) for part, names in LAFAN.items()}
 MIXAMO["toe"] = "mixamorig:*ToeBase"
 XSENS = {
-    "hips": "Pelvis", "spine": "L5 L3 T12 T8", "neck": "Neck", "head": "Head", "collar": "*Shoulder", "arm": "*UpperArm",
-    "elbow": "*ForeArm", "wrist": "*Hand", "thigh": "*UpperLeg", "knee": "*LowerLeg", "ankle": "*Foot", "toe": "*Toe",
-}  # fmt: skip
-STYLE = {
-    "hips": "Hips", "spine": "Chest Chest2 Chest3 Chest4 Chest5", "neck": "Neck", "head": "Head", "collar": "*Collar",
-    "arm": "*Shoulder", "elbow": "*Elbow", "wrist": "*Wrist", "thigh": "*Hip", "knee": "*Knee", "ankle": "*Ankle",
+    "hips": "Pelvis",
+    "spine": "L5 L3 T12 T8",
+    "neck": "Neck",
+    "head": "Head",
+    "collar": "*Shoulder",
+    "arm": "*UpperArm",
+    "elbow": "*ForeArm",
+    "wrist": "*Hand",
+    "thigh": "*UpperLeg",
+    "knee": "*LowerLeg",
+    "ankle": "*Foot",
     "toe": "*Toe",
-}  # fmt: skip
+}
+STYLE = {
+    "hips": "Hips",
+    "spine": "Chest Chest2 Chest3 Chest4 Chest5",
+    "neck": "Neck",
+    "head": "Head",
+    "collar": "*Collar",
+    "arm": "*Shoulder",
+    "elbow": "*Elbow",
+    "wrist": "*Wrist",
+    "thigh": "*Hip",
+    "knee": "*Knee",
+    "ankle": "*Ankle",
+    "toe": "*Toe",
+}
 UNREAL = {
-    "hips": "pelvis", "spine": "spine_01 spine_02", "neck": "neck_01", "head": "head", "collar": "clavicle_*",
-    "arm": "upperarm_*", "elbow": "lowerarm_*", "wrist": "hand_*", "thigh": "thigh_*", "knee": "calf_*",
-    "ankle": "foot_*", "toe": "ball_*", "finger1": "middle_01_*", "finger2": "middle_02_*",
-}  # fmt: skip
+    "hips": "pelvis",
+    "spine": "spine_01 spine_02",
+    "neck": "neck_01",
+    "head": "head",
+    "collar": "clavicle_*",
+    "arm": "upperarm_*",
+    "elbow": "lowerarm_*",
+    "wrist": "hand_*",
+    "thigh": "thigh_*",
+    "knee": "calf_*",
+    "ankle": "foot_*",
+    "toe": "ball_*",
+    "finger1": "middle_01_*",
+    "finger2": "middle_02_*",
+}
 
 
 @pytest.fixture(scope="module")
@@ -69,8 +110,13 @@ def xsens_like():
     return in_another_pose(motion, turns)
 
 
-SOURCES = [lafan_like, mixamo_like, xsens_like,
-           lambda: moved(*biped(STYLE, spine=5, hands=False), seed=4), lambda: moved(*biped(UNREAL, spine=2), seed=5)]  # fmt: skip
+SOURCES = [
+    lafan_like,
+    mixamo_like,
+    xsens_like,
+    lambda: moved(*biped(STYLE, spine=5, hands=False), seed=4),
+    lambda: moved(*biped(UNREAL, spine=2), seed=5),
+]
 
 
 def bones_apart(source, found, rig):
@@ -126,8 +172,10 @@ def test_a_spine_of_another_length_shares_out_its_turn(spine, rig):
     motion.rotations[:, spines] = bend
     found = retarget(motion, match="limbs")
     turns = soma_skeleton(found.motion, rig).turns()[0]
-    angles = [np.degrees(Rotation.from_matrix(turns[USER_JOINTS.index(name)]).magnitude())
-              for name in ("Spine1", "Spine2", "Chest", "Neck1")]  # fmt: skip
+    angles = [
+        np.degrees(Rotation.from_matrix(turns[USER_JOINTS.index(name)]).magnitude())
+        for name in ("Spine1", "Spine2", "Chest", "Neck1")
+    ]
     total = np.degrees(0.2 * spine)
     assert angles[2:] == pytest.approx([total, total], abs=1e-3)
     assert angles[1] - angles[0] == pytest.approx(angles[2] - angles[1], abs=1e-3)
@@ -164,15 +212,25 @@ def test_feet_stand_where_they_stood(rig):
 
 
 def test_names_that_are_not_known_give_the_template_of_a_mapping(tmp_path, rig):
-    strange = {part: " ".join(f"bone{index}*{word}" for word in range(len(names.split())))
-               for index, (part, names) in enumerate(LAFAN.items())}  # fmt: skip
+    strange = {
+        part: " ".join(f"bone{index}*{word}" for word in range(len(names.split())))
+        for index, (part, names) in enumerate(LAFAN.items())
+    }
     source = moved(*biped(strange), seed=8)
     write_bvh(source, tmp_path / "strange.bvh")
     with pytest.raises(InputError, match="mapping=FILE") as caught:
         convert_file(tmp_path / "strange.bvh", tmp_path / "out")
     template = json.loads(re.search(r"\{.*\}", str(caught.value), re.DOTALL)[0])
-    parts = {"Shoulder": "collar", "Arm": "arm", "ForeArm": "elbow", "Hand": "wrist", "Leg": "thigh", "Shin": "knee",
-             "Foot": "ankle", "ToeBase": "toe"}  # fmt: skip
+    parts = {
+        "Shoulder": "collar",
+        "Arm": "arm",
+        "ForeArm": "elbow",
+        "Hand": "wrist",
+        "Leg": "thigh",
+        "Shin": "knee",
+        "Foot": "ankle",
+        "ToeBase": "toe",
+    }
     for target in template:
         side = target[: len(target) - len(target.removeprefix("Left").removeprefix("Right"))]
         part = (
