@@ -11,13 +11,14 @@ from typing import TypeAlias
 
 import hydra
 from hydra.core.hydra_config import HydraConfig
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 
+from soma_core.config.overrides import literal_texts
 from soma_core.config.refusals import REFUSALS, check_backend_choice, in_our_words
 from soma_core.config.run_folder import run_log, write_provenance
-from soma_core.config.schema import register_schemas
+from soma_core.config.schema import SCHEMAS, register_schemas
 from soma_core.config.searchpath import register_search_path
-from soma_core.errors import SomaError
+from soma_core.errors import InputError, SomaError
 
 __all__ = ["Task", "run_task"]
 
@@ -48,9 +49,13 @@ def run_task(
     """
     register_schemas()
     register_search_path()
+    running: list[Path] = []
 
     def job(config: DictConfig) -> None:
-        folder = Path(HydraConfig.get().runtime.output_dir)
+        # As hydra made it: a name that holds ${...} would be taken for an interpolation when it is read.
+        runtime = OmegaConf.to_container(HydraConfig.get().runtime, resolve=False)
+        folder = Path(runtime["output_dir"])
+        running.append(folder)
         try:
             with run_log(folder):
                 check_backend_choice(config)
@@ -62,12 +67,28 @@ def run_task(
             report(error)
         else:
             report(folder)
+        running.clear()
 
-    with _hydra_process(program, overrides):
+    with _hydra_process(program, literal_texts(overrides, SCHEMAS[config_name])):
         try:
             hydra.main(config_path=None, config_name=config_name, version_base="1.3")(job)()
         except REFUSALS as error:
             raise in_our_words(error) from error
+        except OSError as error:
+            if running:
+                raise
+            raise _no_folder(error, config_name) from error
+
+
+def _no_folder(error: OSError, config_name: str) -> InputError:
+    """Say that the folder of a run cannot be made, and which setting names another."""
+    setting = "out" if config_name == "convert" else "hydra.run.dir"
+    files = isinstance(error, FileExistsError | NotADirectoryError)
+    why = "a file of that name is in the way" if files else error.strerror
+    return InputError(
+        setting, got=f"{error.filename}, which cannot be made ({why})", expected="a folder, or a new name",
+        fix=f"Pass {setting}=DIR.",
+    )  # fmt: skip
 
 
 @contextmanager

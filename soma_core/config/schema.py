@@ -25,6 +25,7 @@ from soma_core.options import (
 )
 
 __all__ = [
+    "SCHEMAS",
     "AnimateConfig",
     "BenchConfig",
     "ConvertConfig",
@@ -190,17 +191,21 @@ class WrapConfig:
     picture: bool = True
 
 
+SCHEMAS: dict[str, type] = {
+    "animate": AnimateConfig,
+    "invert": InvertConfig,
+    "convert": ConvertConfig,
+    "train_shape": TrainShapeConfig,
+    "train_correctives": TrainCorrectivesConfig,
+    "evaluate": EvaluateConfig,
+    "bench": BenchConfig,
+    "wrap": WrapConfig,
+}
+"""Task -> schema of its configuration."""
+
+
 def register_schemas() -> None:
     """Make the schemas known to hydra under ``<task>_schema``; safe to call again."""
     store = ConfigStore.instance()
-    for task, schema in (
-        ("animate", AnimateConfig),
-        ("invert", InvertConfig),
-        ("convert", ConvertConfig),
-        ("train_shape", TrainShapeConfig),
-        ("train_correctives", TrainCorrectivesConfig),
-        ("evaluate", EvaluateConfig),
-        ("bench", BenchConfig),
-        ("wrap", WrapConfig),
-    ):
+    for task, schema in SCHEMAS.items():
         store.store(name=f"{task}_schema", node=schema)

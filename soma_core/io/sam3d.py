@@ -14,6 +14,7 @@ import numpy as np
 from soma_core.errors import AssetError, InputError
 from soma_core.files import refuse_unreadable
 from soma_core.io.npz_fields import NpzFields, open_npz
+from soma_core.paths import expanded
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -90,7 +91,7 @@ def read_sam3d(path: str | Path, *, axes: Literal["camera", "model"] = "camera")
         AssetError: missing, damaged, or no file of its suffix.
         InputError: no vertices, another mesh than MHR LOD 1, another unit, or numbers that are not finite.
     """
-    path = Path(path).expanduser()
+    path = expanded(path)
     suffix = path.suffix.lower()
     if suffix not in SAM3D_SUFFIXES:
         raise InputError(

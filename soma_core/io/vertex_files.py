@@ -13,6 +13,7 @@ from soma_core.io.vertex_folder import FolderSequence
 from soma_core.io.vertex_glb import GlbSequence
 from soma_core.io.vertex_sequence import UpAxis, VertexSequence
 from soma_core.io.vertex_usd import UsdSequence
+from soma_core.paths import expanded
 from soma_core.topology.frames import METRES
 
 __all__ = ["open_vertex_sequence"]
@@ -43,7 +44,7 @@ def open_vertex_sequence(
         AssetError: the file is missing, damaged or a git-LFS pointer.
         InputError: a format or a layout that is not read, or a frame rate that is not positive.
     """
-    path = Path(path).expanduser()
+    path = expanded(path)
     sequence = _open(path)
     if fps is not None:
         sequence.fps = float(fps)

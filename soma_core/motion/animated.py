@@ -16,7 +16,7 @@ from soma_core.io.motion import Motion
 from soma_core.io.motion_files import check_rig, read_motion
 from soma_core.layer import SomaLayer
 from soma_core.options import FrameRange
-from soma_core.paths import assets_dir
+from soma_core.paths import assets_dir, expanded
 from soma_core.progress import progress
 
 if TYPE_CHECKING:
@@ -62,7 +62,7 @@ def load_clip(
         SomaError: the file cannot be read.
         InputError: no frame is left.
     """
-    path = Path(path).expanduser() if path else assets_dir() / "motions/range_of_motion.npz"
+    path = expanded(path) if path else assets_dir() / "motions/range_of_motion.npz"
     motion, frames = read_motion(path, fps=fps), frames or FrameRange()
     part = slice(frames.start, frames.stop, frames.step)
     if part.step < 1 or not len(range(motion.frame_count)[part]):

@@ -19,6 +19,7 @@ from soma_core.motion.converter import Converted, Converter
 from soma_core.motion.files import SUFFIXES, ResultFiles, layout_of
 from soma_core.motion.options import ConvertOptions
 from soma_core.options import Picture
+from soma_core.paths import expanded
 
 __all__ = ["FolderConverted", "convert", "convert_file", "convert_folder"]
 
@@ -60,7 +61,7 @@ def convert_file(source: str | Path, out: str | Path, *, options: ConvertOptions
     """
     out = Path(out)
     convert = _converter(options or ConvertOptions())
-    return convert(Path(source).expanduser(), ResultFiles.of_folder(out), out / "chunks")
+    return convert(expanded(source), ResultFiles.of_folder(out), out / "chunks")
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -98,7 +99,7 @@ def convert_folder(
     Raises:
         InputError: no file may hold a motion.
     """
-    folder, out = Path(folder).expanduser(), Path(out)
+    folder, out = expanded(folder), Path(out)
     if not folder.is_dir():
         raise InputError(
             str(folder), got="no folder", expected="one that holds motion files",

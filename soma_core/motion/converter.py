@@ -19,6 +19,7 @@ from soma_core.motion.files import Layout, ResultFiles, layout_of, read, write
 from soma_core.motion.fit_job import FitJob, FitPlan, fit_settings, plan_body
 from soma_core.motion.models import FitBackends
 from soma_core.motion.options import ConvertOptions, InvertOptions
+from soma_core.paths import expanded
 
 __all__ = ["Converted", "Converter", "earlier_report", "finish_fit", "invert", "plan_fit"]
 
@@ -148,7 +149,7 @@ def invert(source: str | Path, out: str | Path, *, options: InvertOptions | None
         SomaError: the backend or the file cannot be used, or the fit is none; what there is of it is
             written all the same.
     """
-    source, out, options = Path(source).expanduser(), Path(out), options or InvertOptions()
+    source, out, options = expanded(source), Path(out), options or InvertOptions()
     body, files = open_body(source, "vertices", options), ResultFiles.of_folder(out)
     with body.posed.sequence as shown:
         _log.info(
@@ -174,7 +175,7 @@ def plan_fit(
         InputError: the file is of this skeleton, and needs no fit.
     """
     source, out = (
-        Path(source).expanduser().resolve(),
+        expanded(source).resolve(),
         Path(out).resolve(),
     )  # another process may stand elsewhere
     options = options or ConvertOptions()

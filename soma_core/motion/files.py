@@ -15,6 +15,7 @@ from soma_core.io.npz_fields import open_npz
 from soma_core.io.sam3d import SAM3D_SUFFIXES
 from soma_core.io.soma_npz import METRES_PER_UNIT
 from soma_core.options import LengthUnit
+from soma_core.paths import expanded
 from soma_core.rig import load_canonical
 from soma_core.topology.frames import METRES
 
@@ -68,7 +69,7 @@ def layout_of(path: str | Path) -> Layout | None:
     Raises:
         AssetError: the file is missing, damaged, a git-LFS pointer or no NPZ.
     """
-    path = Path(path).expanduser()
+    path = expanded(path)
     if path.suffix.lower() == ".parquet":
         return "sam3d"
     with open_npz(path) as fields:

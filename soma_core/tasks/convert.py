@@ -10,6 +10,7 @@ from omegaconf import OmegaConf
 
 from soma_core.errors import AssetError, InputError, SomaError
 from soma_core.motion.conversion import FolderConverted, convert_file, convert_folder
+from soma_core.paths import expanded
 
 if TYPE_CHECKING:
     from omegaconf import DictConfig
@@ -32,7 +33,7 @@ def run(config: DictConfig, output: Path) -> None:
         raise InputError(
             "input", got="none", expected="a motion file, or a folder of them", fix="Pass input=FILE."
         )
-    path = Path(options.input).expanduser()
+    path = expanded(options.input)
     if not path.exists():
         raise AssetError(path, cause="file is missing", fix="Check the path.")
     try:

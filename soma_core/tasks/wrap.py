@@ -12,6 +12,7 @@ from omegaconf import OmegaConf
 
 from soma_core.errors import AssetError, InputError
 from soma_core.options import BackendChoice
+from soma_core.paths import expanded
 from soma_core.plugin.registry import default_registry
 from soma_core.plugin.spec import WrapPair
 from soma_core.registration.native_mesh import NativeMesh, neutral_mesh, read_native_mesh
@@ -40,7 +41,7 @@ def run(config: DictConfig, output: Path) -> None:
     native = _read_native(config)
     found = register(native.vertices, native.triangles, options=_options(config, native))
     quality = measure(found, mesh)
-    folder = Path(config.out).expanduser() if config.out else output
+    folder = expanded(config.out) if config.out else output
     pair = write_pair(folder, found, mesh, vertices=native.vertices, triangles=native.triangles,
                       name=native.name, source=native.file)  # fmt: skip
     write_report(folder, found, quality, native=pair.native.name)
@@ -84,7 +85,7 @@ def _read_native(config: DictConfig) -> NativeMesh:
     if chosen:
         backend: BackendChoice = OmegaConf.to_object(config.backend)
         return neutral_mesh(default_registry(), backend.name, options=backend.options, params=backend.params)
-    return read_native_mesh(Path(config.native).expanduser())
+    return read_native_mesh(expanded(config.native))
 
 
 def _options(config: DictConfig, native: NativeMesh) -> WrapOptions:
@@ -112,7 +113,7 @@ def _json(name: str | None, kind: type, expected: str) -> Any:
     """Content of a JSON file of integers, empty where none is named."""
     if name is None:
         return kind()
-    path = Path(name).expanduser()
+    path = expanded(name)
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
         items = [*content, *content.values()] if isinstance(content, dict) else content
