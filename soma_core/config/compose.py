@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import os
 import sys
 from collections.abc import Callable, Iterator, Sequence
@@ -59,6 +60,7 @@ def run_task(
         try:
             with run_log(folder):
                 check_backend_choice(config)
+                _check_device(config)
                 write_provenance(folder, config, command=[*program.split(), *overrides])
                 task()(config, folder)
         except SomaError as error:
@@ -75,9 +77,15 @@ def run_task(
         except REFUSALS as error:
             raise in_our_words(error) from error
         except OSError as error:
-            if running:
+            if running or error.filename is None:
                 raise
             raise _no_folder(error, config_name) from error
+
+
+def _check_device(config: DictConfig) -> None:
+    """Refuse a device that this machine has not, before anything is written; `--help` imports no torch."""
+    if config.get("device") is not None:
+        importlib.import_module("soma_core._inputs").usable_device(config.device)
 
 
 def _no_folder(error: OSError, config_name: str) -> InputError:
