@@ -16,7 +16,9 @@ from soma_core.errors import InputError
 
 __all__ = [
     "AnalyticalChoice",
+    "AngleUnit",
     "AutogradChoice",
+    "Axes",
     "BackendChoice",
     "BodyGender",
     "ConvertResult",
@@ -94,7 +96,7 @@ class Kernels(StrEnum):
 
 
 class LengthUnit(StrEnum):
-    """Unit of a file's vertices."""
+    """Unit of a file's lengths."""
 
     m = "m"
     cm = "cm"
@@ -134,11 +136,21 @@ class Translation(StrEnum):
     none = "none"
 
 
-class Upward(StrEnum):
-    """Upward axis of a file's vertices."""
+Upward = StrEnum("Upward", {"y": "y", "z": "z", "-y": "-y", "-z": "-z", "+y": "y", "+z": "z"})
+"""Upward axis of a file's world; ``+y`` is another name of ``y``."""
 
-    y = "y"
-    z = "z"
+
+class Axes(StrEnum):
+    """Axes of a file's world by name: a camera's have y down, and z forward, away from it."""
+
+    camera = "camera"
+
+
+class AngleUnit(StrEnum):
+    """Unit of a file's rotation vectors."""
+
+    rad = "rad"
+    deg = "deg"
 
 
 class Options:

@@ -8,7 +8,7 @@ import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 import hydra
 from hydra.core.hydra_config import HydraConfig
@@ -54,7 +54,7 @@ def run_task(
 
     def job(config: DictConfig) -> None:
         # As hydra made it: a name that holds ${...} would be taken for an interpolation when it is read.
-        runtime = OmegaConf.to_container(HydraConfig.get().runtime, resolve=False)
+        runtime: Any = OmegaConf.to_container(HydraConfig.get().runtime, resolve=False)
         folder = Path(runtime["output_dir"])
         running.append(folder)
         try:

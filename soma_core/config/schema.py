@@ -53,6 +53,7 @@ class _PlayedMotion(Options):
     backends: Gallery = Gallery.one
     motion: str | None = None
     motion_fps: float | None = None
+    motion_unit: LengthUnit | None = None
     identity_from: IdentitySource = IdentitySource.backend
     frames: FrameRange = field(default_factory=FrameRange)
     translation: Translation = Translation.ground

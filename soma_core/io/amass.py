@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,7 +12,8 @@ import numpy as np
 
 from soma_core.cache import atomic_arrays
 from soma_core.errors import InputError
-from soma_core.io.npz_fields import NpzFields, open_npz
+from soma_core.io.npz_fields import NpzFields, open_npz, say_overridden
+from soma_core.io.vertex_sequence import UpAxis
 
 __all__ = [
     "SMPL_JOINTS",
@@ -33,7 +35,11 @@ _PARTS = {"root_orient": 3, "pose_body": 63, "pose_jaw": 3, "pose_eye": 6, "pose
 """Keys that SMPL-X files split the pose into, in the order of the joints, and their widths."""
 
 _RATES = ("mocap_framerate", "mocap_frame_rate", "fps")
-_SECONDS = "mocap_time_length"
+_SECONDS, _MODEL = "mocap_time_length", "surface_model_type"
+_COUNTED, _LASTING = 1.5, 0.02
+"""Frames, and share of them, that a duration may be off by: ends that were cut, rates that were rounded."""
+
+_log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -62,7 +68,7 @@ class SmplMotion:
     betas: np.ndarray
     gender: Gender
     fps: float
-    up: Literal["+y", "+z"] = "+z"
+    up: UpAxis = "+z"
     source: str = ""
 
     def __post_init__(self) -> None:
@@ -72,7 +78,7 @@ class SmplMotion:
         for name, value, among in (
             ("model", self.model, get_args(SmplName)),
             ("gender", self.gender, get_args(Gender)),
-            ("up", self.up, ("+y", "+z")),
+            ("up", self.up, get_args(UpAxis)),
         ):
             if value not in among:
                 expected = "one of " + ", ".join(map(repr, among))
@@ -108,7 +114,7 @@ def read_amass(
     *,
     fps: float | None = None,
     gender: Gender | None = None,
-    up: Literal["+y", "+z"] | None = None,
+    up: UpAxis | None = None,
 ) -> SmplMotion:
     """Read an ``.npz`` of AMASS: SMPL-H (``poses`` of 156 values), SMPL-X (parts, or 165), also SMPL (72).
 
@@ -127,13 +133,14 @@ def read_amass(
     with open_npz(path) as fields:
         poses = _poses(fields)
         model = next(name for name, count in SMPL_JOINTS.items() if 3 * count == poses.shape[1])
+        _question_model(fields, model)
         return SmplMotion(
             model=model,
             rotations=poses.reshape(len(poses), -1, 3),
             translation=fields.numbers("trans", (len(poses), 3)),
             betas=_betas(fields, len(poses)),
-            gender=gender or _gender(fields),
-            fps=_rate(fields) if fps is None else float(fps),
+            gender=_asked_gender(fields, gender) or _gender(fields),
+            fps=_rate(fields, len(poses), fps),
             up=up or "+z",
             source=fields.path.name,
         )
@@ -172,6 +179,35 @@ def _betas(fields: NpzFields, frames: int) -> np.ndarray:
     return rows[0]
 
 
+def _question_model(fields: NpzFields, model: SmplName) -> None:
+    """Warn where the betas of a file were fitted with another model than its poses are for."""
+    own = (
+        fields.texts(_MODEL)[0].lower() if _MODEL in fields and fields.raw(_MODEL).dtype.kind in "SU" else ""
+    )
+    if own.replace("+", "") in ("", model):
+        return
+    mend = (
+        "keep only its files (..._2020) in the folder SMPLX"
+        if "locked" in own
+        else f"poses are those of {model}"
+    )
+    _log.warning(
+        "%s: the betas belong to the model %r (%s), which is not %s; %s",
+        fields.path.name, own, _MODEL, model, mend,
+    )  # fmt: skip
+
+
+def _asked_gender(fields: NpzFields, gender: Gender | None) -> Gender | None:
+    """The gender that is asked for; a warning where the file's betas belong to another."""
+    if gender is not None and "gender" in fields and fields.raw("gender").dtype.kind in "SU":
+        own = fields.text("gender").lower()
+        if own in get_args(Gender) and own != gender:
+            say_overridden(
+                fields.path, "gender", given=gender, own=f"{own}, whose betas are another body there"
+            )
+    return gender
+
+
 def _gender(fields: NpzFields) -> Gender:
     name = fields.text("gender").lower()
     if name not in get_args(Gender):
@@ -184,8 +220,15 @@ def _gender(fields: NpzFields) -> Gender:
     return cast("Gender", name)
 
 
-def _rate(fields: NpzFields) -> float:
-    key = next((key for key in _RATES if key in fields), None)
+def _rate(fields: NpzFields, frames: int, fps: float | None) -> float:
+    """The frame rate that is asked for, else the file's; a warning where the file contradicts either."""
+    found = {key: fields.number(key) for key in _RATES if key in fields}
+    if fps is not None:
+        for own in found.values():
+            say_overridden(fields.path, "fps", given=float(fps), own=own)
+        return float(fps)
+    seconds = fields.number(_SECONDS) if _SECONDS in fields else 0.0
+    key = next((key for key in found if _lasts(frames, found[key], seconds)), next(iter(found), None))
     if key is None:
         raise fields.refuse(
             _RATES[0],
@@ -193,12 +236,25 @@ def _rate(fields: NpzFields) -> float:
             expected="frames per second",
             fix="Pass fps=120 (or the true rate).",
         )
-    rate = fields.number(key)
+    rate = found[key]
     if rate <= 0:
         raise fields.refuse(
             key, got=f"{rate:g}", expected="a positive number", fix="Pass fps=120 (the true rate)."
         )
+    others = [f"{name}={other:g}" for name, other in found.items() if not np.isclose(other, rate, rtol=1e-3)]
+    if seconds > 0 and not _lasts(frames, rate, seconds):
+        others.append(f"{_SECONDS}={seconds:g}, which {frames} frames last at {frames / seconds:.4g}")
+    if others:
+        _log.warning(
+            "%s: %s=%g is taken for the frame rate, against %s; pass fps= for another",
+            fields.path.name, key, rate, " and ".join(others),
+        )  # fmt: skip
     return rate
+
+
+def _lasts(frames: int, rate: float, seconds: float) -> bool:
+    """Whether so many frames last about so long; a file may count one more or one less."""
+    return abs(frames - seconds * rate) <= max(_COUNTED, _LASTING * frames)
 
 
 def write_amass(
@@ -220,7 +276,7 @@ def write_amass(
     poses = motion.rotations.reshape(motion.frame_count, -1)
     values: dict[str, object] = {
         "poses": poses, "trans": motion.translation, "betas": motion.betas, "gender": motion.gender,
-        "surface_model_type": motion.model,
+        _MODEL: motion.model,
     }  # fmt: skip
     if motion.model == "smplx":
         ends = np.cumsum(list(_PARTS.values()))

@@ -8,6 +8,7 @@ from scipy.spatial.transform import Rotation
 from soma_core.io.joint_order import KIMODO_30_JOINTS, USER_JOINTS, nearest_ancestors
 from soma_core.io.motion import Motion
 from soma_core.io.npz_fields import NpzFields, check_rotations
+from soma_core.topology.frames import METRES_PER_UNIT
 
 __all__ = ["KIMODO_FPS", "read_kimodo_npz"]
 
@@ -17,7 +18,7 @@ KIMODO_FPS = 30.0
 _ORDERS = {77: USER_JOINTS, 30: KIMODO_30_JOINTS}
 
 
-def read_kimodo_npz(fields: NpzFields, *, fps: float | None) -> Motion:
+def read_kimodo_npz(fields: NpzFields, *, fps: float | None, unit: str | None = None) -> Motion:
     """Read a kimodo motion (metres, +Y up, +Z forward; rotations relative to the T-pose).
 
     The local rotation of a joint is the transposed world rotation of its nearest stored ancestor times
@@ -43,7 +44,7 @@ def read_kimodo_npz(fields: NpzFields, *, fps: float | None) -> Motion:
             rotations[:, USER_JOINTS.index(name)] = local[:, index]
     return Motion(
         rotations=rotations,
-        translation=_hips(fields, frames, count),
+        translation=_hips(fields, frames, count) * METRES_PER_UNIT[unit or "meters"],
         fps=KIMODO_FPS if fps is None else float(fps),
         joint_names=USER_JOINTS,
         source=f"kimodo motion {fields.path.name}",

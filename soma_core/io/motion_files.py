@@ -32,6 +32,7 @@ def read_motion(
     fps: float | None = None,
     unit: str | None = None,
     convention: Convention | None = None,
+    angles: Literal["rad", "deg"] | None = None,
 ) -> Motion:
     """Read a motion from an NPZ file: our schema, the SOMA tools' files, or kimodo's.
 
@@ -40,6 +41,7 @@ def read_motion(
         fps: frame rate; needed where the file has none (SOMA tools). kimodo files count as 30.
         unit: ``meters``, ``centimeters`` or ``millimeters``; overrides the file's own.
         convention: what zero means; overrides the file's own.
+        angles: unit of rotation vectors; None for radians.
 
     Returns:
         The motion in metres, +Y up, 77 joints with Hips first.
@@ -50,9 +52,9 @@ def read_motion(
     """
     with open_npz(path) as fields:
         if "global_rot_mats" in fields or "local_rot_mats" in fields:
-            return read_kimodo_npz(fields, fps=fps)
+            return read_kimodo_npz(fields, fps=fps, unit=unit)
         if "schema_version" in fields or ("poses" in fields and "transl" in fields):
-            return read_soma_npz(fields, fps=fps, unit=unit, convention=convention)
+            return read_soma_npz(fields, fps=fps, unit=unit, convention=convention, angles=angles)
         raise fields.refuse(
             "layout",
             got=f"the keys {', '.join(fields.names) or '(none)'}",

@@ -20,7 +20,7 @@ __all__ = ["ArraySequence", "open_npy", "open_npz_vertices"]
 
 _KEY = "vertices"
 _UNITS = METRES_PER_UNIT | {str(unit): metres for unit, metres in METRES.items()}
-_AXES: dict[str, UpAxis] = {"Y": "+y", "Z": "+z"}
+_AXES: dict[str, UpAxis] = {"Y": "+y", "Z": "+z", "-Y": "-y", "-Z": "-z"}
 _Named = TypeVar("_Named")
 _DAMAGE = (ValueError, EOFError, OSError, RuntimeError, MemoryError, zipfile.BadZipFile, zlib.error)
 _ARCHIVE_DAMAGE = (EOFError, OSError, RuntimeError, zipfile.BadZipFile, zlib.error)

@@ -8,6 +8,7 @@ from typing import Literal
 
 from soma_core.errors import InputError
 from soma_core.files import refuse_unreadable
+from soma_core.io.npz_fields import say_overridden
 from soma_core.io.vertex_arrays import open_npy, open_npz_vertices
 from soma_core.io.vertex_folder import FolderSequence
 from soma_core.io.vertex_glb import GlbSequence
@@ -46,6 +47,12 @@ def open_vertex_sequence(
     """
     path = expanded(path)
     sequence = _open(path)
+    metres = sequence.metres
+    length = next((name for name, each in METRES.items() if each == metres), metres and f"{metres:g} m")
+    asked = {"fps": (fps, sequence.fps), "unit": (unit, length), "up": (up, sequence.up)}
+    for name, (given, own) in asked.items():
+        if given is not None and own is not None:
+            say_overridden(path, name, given=given, own=own)
     if fps is not None:
         sequence.fps = float(fps)
     if sequence.fps is not None and not (math.isfinite(sequence.fps) and sequence.fps > 0):

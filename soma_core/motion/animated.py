@@ -13,9 +13,11 @@ import torch
 
 from soma_core.errors import InputError
 from soma_core.io.motion import Motion
-from soma_core.io.motion_files import check_rig, read_motion
+from soma_core.io.motion_files import check_rig
 from soma_core.layer import SomaLayer
-from soma_core.options import FrameRange
+from soma_core.motion.files import read
+from soma_core.motion.questions import Names, of_motion, say
+from soma_core.options import FrameRange, LengthUnit
 from soma_core.paths import assets_dir, expanded
 from soma_core.progress import progress
 
@@ -49,13 +51,18 @@ class Animated:
 
 
 def load_clip(
-    path: str | Path | None = None, *, fps: float | None = None, frames: FrameRange | None = None
+    path: str | Path | None = None,
+    *,
+    fps: float | None = None,
+    unit: LengthUnit | str | None = None,
+    frames: FrameRange | None = None,
 ) -> Motion:
     """Some frames of a motion file.
 
     Args:
         path: a motion on this skeleton; None for the clip that ships with the project.
         fps: frame rate, where the file has none.
+        unit: ``m``, ``cm`` or ``mm``, where the file does not say or is wrong.
         frames: which; None for all.
 
     Raises:
@@ -63,7 +70,8 @@ def load_clip(
         InputError: no frame is left.
     """
     path = expanded(path) if path else assets_dir() / "motions/range_of_motion.npz"
-    motion, frames = read_motion(path, fps=fps), frames or FrameRange()
+    motion, frames = read(path, fps=fps, unit=unit), frames or FrameRange()
+    say(path.name, of_motion(motion, Names(unit="motion_unit", fps="motion_fps", ups=())))
     part = slice(frames.start, frames.stop, frames.step)
     if part.step < 1 or not len(range(motion.frame_count)[part]):
         raise InputError(

@@ -22,12 +22,13 @@ from soma_core.layer import SomaLayer
 from soma_core.motion.animated import animate
 from soma_core.motion.chunks import FittedChunks
 from soma_core.motion.converter import Converted, earlier_report
-from soma_core.motion.files import ResultFiles, fingerprint, layout_of, read
+from soma_core.motion.files import ResultFiles, fingerprint, layout_of, no_motion, read
 from soma_core.motion.identities import stored_identity
 from soma_core.motion.models import model_settings, open_layer
 from soma_core.motion.native_errors import NativeErrors
 from soma_core.motion.native_results import NativeTarget, SmplTarget, VertexTarget
 from soma_core.motion.options import ConvertOptions
+from soma_core.motion.questions import heard, of_motion, of_params, say
 from soma_core.native import NativeFit, NativeTransfer
 from soma_core.progress import progress
 from soma_core.skeleton.identity import Identity
@@ -75,16 +76,23 @@ class BackConverter:
     def __call__(self, path: Path, files: ResultFiles, chunks: Path) -> Converted:
         """Convert a file; see ``Converter``."""
         layout = layout_of(path)
+        if layout is None:
+            raise no_motion(path)[0]
         if layout not in ("soma", "kimodo"):
             raise InputError(
                 str(path),
-                got=f"the layout {layout}" if layout else "no motion under any key that is known",
+                got=f"the layout {layout}",
                 expected="a motion on this skeleton, for the way back",
                 fix="Convert it with to=soma first.",
             )
-        motion = read(path, fps=self._options.fps, unit=self._options.unit)
-        layer, stored = self._body(path, motion)
-        target = self._target(stored)
+        options = self._options
+        with heard() as said:
+            motion = read(path, fps=options.fps, unit=options.unit, angles=options.angles)
+            layer, stored = self._body(path, motion)
+            target = self._target(stored)
+            say(path.name, of_motion(motion) + of_params(layer.spec, stored.get("params", {})))
+            if isinstance(target, SmplTarget) and options.betas is not None:
+                say(path.name, of_params(target.fit.spec, target.params or {}))
         settings = {
             "input": str(path.resolve()), "layout": layout, "fps": motion.fps, "body": stored["backend"],
             "body_params": stored.get("params"), "translation": str(self._options.translation),
@@ -101,7 +109,7 @@ class BackConverter:
             settings["found"] = target.params
         _convert_missing(body, target, kept)
         figures = target.write(kept, files, fps=motion.fps, source=motion.source)
-        report = {"settings": settings, **figures}
+        report = {"settings": settings, **figures, "warnings": said}
         atomic_text(files.report, json.dumps(report, indent=2, default=float) + "\n")
         kept.remove()
         return Converted(report=report, files=files, vertices=vertices)
@@ -139,14 +147,16 @@ class BackConverter:
                 fix="Pass result=vertices; in Python, NativeFit gives the poses of other skinned models.",
             )  # fmt: skip
         own = stored if stored["backend"] == name and "rest" not in stored else {}
-        gender = str(chosen.gender or own.get("options", {}).get("gender", "neutral"))
+        kept = str(own.get("options", {}).get("gender", "neutral"))
+        gender = str(chosen.gender or kept)
+        own = own if gender == kept else {}  # its coefficients are another body in another gender's model
         params = {"betas": list(chosen.betas)} if chosen.betas is not None else own.get("params")
         if gender not in self._targets:
             self._targets[gender] = NativeFit(name, options={"gender": gender}, **kind)
         fit = self._targets[gender]
         errors = NativeErrors(fit.transfer, kind["lod"])
         return SmplTarget(
-            fit=fit, errors=errors, model=name, gender=gender, up=f"+{chosen.up or 'z'}", params=params
+            fit=fit, errors=errors, model=name, gender=gender, up=chosen.upward or "+z", params=params
         )
 
 

@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from soma_core.errors import AssetError, InputError
 from soma_core.io.amass import SmplMotion, read_amass
+from soma_core.io.rotation_vectors import in_radians
 from soma_core.io.sam3d import Sam3dFrames, read_sam3d
 from soma_core.io.vertex_files import open_vertex_sequence
 from soma_core.motion.models import (
@@ -24,6 +23,7 @@ from soma_core.motion.models import (
 )
 from soma_core.motion.options import ConvertOptions, FitOptions, InvertOptions
 from soma_core.motion.posed_input import PosedInput
+from soma_core.motion.questions import of_params, of_rate, of_smpl
 from soma_core.plugin.errors import BackendError, BrokenBackendError
 from soma_core.plugin.registry import default_registry
 
@@ -31,11 +31,6 @@ if TYPE_CHECKING:
     from soma_core.plugin.spec import BackendSpec
 
 __all__ = ["FITTED", "ShownBody", "open_body"]
-
-_log = logging.getLogger(__name__)
-
-_UPRIGHT = 0.7
-"""Cosine between the mean upward direction of a body and that of its world, where people mostly stand."""
 
 _MHR, _DEFAULT = "mhr", "soma"
 _BONE_LENGTHS, _SCALES = slice(130, 136), slice(136, 204)
@@ -53,6 +48,7 @@ class ShownBody:
         search: choices of the search for an identity that is not known; empty if it is.
         facts: what else decides the result, for the report.
         licence: of the motion.
+        doubts: what is doubtful about it, for the log and the report.
     """
 
     backend: FitBackend
@@ -61,6 +57,7 @@ class ShownBody:
     search: Mapping[str, Any]
     facts: Mapping[str, Any]
     licence: str = ""
+    doubts: tuple[str, ...] = ()
 
 
 def open_body(path: Path, layout: str, options: FitOptions, backends: FitBackends | None = None) -> ShownBody:
@@ -88,8 +85,8 @@ def _vertex_body(path: Path, options: InvertOptions, backends: FitBackends) -> S
     sequence = open_vertex_sequence(
         path,
         fps=options.fps,
-        unit=str(options.unit) if options.unit else None,
-        up=f"+{options.up}" if options.up else None,
+        unit=options.unit_name,
+        up=options.upward,
     )
     try:
         if sequence.fps is None:
@@ -106,6 +103,7 @@ def _vertex_body(path: Path, options: InvertOptions, backends: FitBackends) -> S
         posed=posed,
         params=options.backend.params,
         search=_search(options),
+        doubts=tuple(of_rate(sequence.fps) + of_params(backend.layer.spec, options.backend.params)),
         facts={"unit_m": sequence.metres, "up": sequence.up, "topology": str(posed.topology)},
     )
 
@@ -125,9 +123,13 @@ def _smpl_body(path: Path, options: ConvertOptions, backends: FitBackends) -> Sh
         path,
         fps=options.fps,
         gender=str(options.gender) if options.gender else None,
-        up=f"+{options.up}" if options.up else None,
+        up=options.upward,
     )
-    _warn_lying(path, motion)
+    motion = replace(
+        motion,
+        rotations=in_radians(path, motion.rotations, options.angles),
+        translation=motion.translation * (options.metres or 1.0),
+    )
     backend = backends.get(motion.model, {"gender": motion.gender})
     params = {"betas": _usable_betas(path, motion, backend.layer.spec, options.most_betas)}
     pose = {"rotations": motion.rotations, "translation": motion.translation}
@@ -137,8 +139,9 @@ def _smpl_body(path: Path, options: ConvertOptions, backends: FitBackends) -> Sh
         posed=PosedInput(sequence, backend.layer, topology="native"),
         params=params,
         search={},
-        facts={"up": motion.up},
+        facts={"up": motion.up, **_units(options)},
         licence=f"that of {path.name}; body model: {backend.layer.spec.licence}",
+        doubts=tuple(of_smpl(motion) + of_params(backend.layer.spec, params)),
     )
 
 
@@ -160,15 +163,10 @@ def _usable_betas(path: Path, motion: SmplMotion, spec: BackendSpec, most: int |
     return [float(value) for value in betas]
 
 
-def _warn_lying(path: Path, motion: SmplMotion) -> None:
-    """Say so where people stand along another axis than the file's world is taken to have."""
-    upward = Rotation.from_rotvec(motion.rotations[:, 0]).apply([0, 1, 0]).mean(axis=0)
-    other = {"+z": "+y", "+y": "+z"}[motion.up]
-    if upward["xyz".index(other[1])] > _UPRIGHT:
-        _log.warning(
-            "%s: the body stands along %s, but the world is taken to have %s up; if not so, pass up=%s",
-            path.name, other, motion.up, other[1],
-        )  # fmt: skip
+def _units(options: ConvertOptions) -> dict[str, str]:
+    """Units that a person gave for a file, for the report."""
+    given = {"unit": options.unit, "angles": options.angles}
+    return {name: str(value) for name, value in given.items() if value is not None}
 
 
 def _sam3d_body(path: Path, options: ConvertOptions, backends: FitBackends) -> ShownBody:
@@ -183,7 +181,7 @@ def _sam3d_body(path: Path, options: ConvertOptions, backends: FitBackends) -> S
             f"{path}: fps", got="none: SAM 3D Body sees pictures", expected="frames per second",
             fix="Pass fps=30 (or the true rate).",
         )  # fmt: skip
-    frames = read_sam3d(path)
+    frames = read_sam3d(path, axes=_sam3d_axes(options), unit=options.unit_name or "m")
     vertices = frames.vertices
     if frames.placement is not None:
         vertices = vertices + frames.placement[:, None]
@@ -197,8 +195,22 @@ def _sam3d_body(path: Path, options: ConvertOptions, backends: FitBackends) -> S
         posed = PosedInput(TransferredSequence(sequence, _MHR), backend.layer, topology="canonical")
     return ShownBody(
         backend=backend, posed=posed, params=params, search=_search(options), facts={"up": "+y"},
-        licence=f"that of {path.name}",
+        licence=f"that of {path.name}", doubts=tuple(of_rate(sequence.fps or 1.0)),
     )  # fmt: skip
+
+
+def _sam3d_axes(options: ConvertOptions) -> Literal["camera", "model"]:
+    """Axes of a SAM 3D Body file: the camera's, unless its vertices were turned upright already.
+
+    Raises:
+        InputError: another axis than these two.
+    """
+    if options.upward not in (None, "+y", "-y"):
+        raise InputError(
+            "up", got=str(options.up), expected="-y, as SAM 3D Body writes, or y for vertices turned back",
+            fix="Leave up out.",
+        )  # fmt: skip
+    return "model" if options.upward == "+y" else "camera"
 
 
 def _check_mhr_pair() -> None:

@@ -16,7 +16,7 @@ from soma_core.errors import InputError, SomaError
 from soma_core.io.motion import Motion
 from soma_core.motion.back import BackConverter
 from soma_core.motion.converter import Converted, Converter
-from soma_core.motion.files import SUFFIXES, ResultFiles, layout_of
+from soma_core.motion.files import SUFFIXES, ResultFiles, layout_of, no_motion
 from soma_core.motion.options import ConvertOptions
 from soma_core.options import Picture
 from soma_core.paths import expanded
@@ -71,7 +71,7 @@ class FolderConverted:
     Attributes:
         converted: those that were converted, by this call or an earlier one.
         errors: what was wrong with those that were not.
-        skipped: those that hold no motion.
+        skipped: those that hold nothing of a motion; files with poses that cannot be read are errors.
     """
 
     converted: dict[str, Converted] = field(default_factory=dict)
@@ -113,7 +113,8 @@ def convert_folder(
             expected="motion files, at any depth",
             fix="Name the folder that holds them.",
         )
-    convert, found, rows = _converter(options or ConvertOptions()), FolderConverted(), {}
+    convert = _converter(options or ConvertOptions(), refuse_unused=False)
+    found, rows = FolderConverted(), {}
     try:
         for number, file in enumerate(files, start=1):
             name = file.relative_to(folder.resolve()).as_posix()
@@ -127,8 +128,8 @@ def convert_folder(
     return found
 
 
-def _converter(options: ConvertOptions) -> Converter | BackConverter:
-    return Converter(options) if options.to == "soma" else BackConverter(options)
+def _converter(options: ConvertOptions, *, refuse_unused: bool = True) -> Converter | BackConverter:
+    return Converter(options, refuse_unused=refuse_unused) if options.to == "soma" else BackConverter(options)
 
 
 def _files(folder: Path) -> Iterator[Path]:
@@ -145,8 +146,12 @@ def _row(
     """Convert one file of a folder; what becomes of it as a row of the report, and in words."""
     try:
         if layout_of(file) is None:
+            reason, poses = no_motion(file)
+            if poses:
+                raise reason
             found.skipped.append(name)
-            return {"state": "skipped", "reason": "holds no motion"}, "holds no motion"
+            told = f"holds no motion: {reason.got}"
+            return {"state": "skipped", "reason": told}, told
         converted = convert(file, ResultFiles.mirrored(out, name), out / "chunks" / name)
     except SomaError as error:
         found.errors[name] = error
@@ -155,4 +160,5 @@ def _row(
     report = converted.report
     row = {"state": "converted", "layout": report["settings"]["layout"], "frames": report["frames"],
            "fps": report["settings"]["fps"], "error_mm": converted.error_mm}  # fmt: skip
+    row |= {"warnings": report["warnings"]} if report.get("warnings") else {}
     return row, str(converted)

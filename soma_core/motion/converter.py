@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import logging
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -15,10 +15,11 @@ from soma_core.io.motion import Motion
 from soma_core.io.motion_files import read_motion
 from soma_core.motion.bodies import FITTED, open_body
 from soma_core.motion.chunks import refuse_other_settings
-from soma_core.motion.files import Layout, ResultFiles, layout_of, read, write
+from soma_core.motion.files import Layout, ResultFiles, layout_of, no_motion, read, write
 from soma_core.motion.fit_job import FitJob, FitPlan, fit_settings, plan_body
 from soma_core.motion.models import FitBackends
 from soma_core.motion.options import ConvertOptions, InvertOptions
+from soma_core.motion.questions import heard, of_motion, say, unused_settings
 from soma_core.paths import expanded
 
 __all__ = ["Converted", "Converter", "earlier_report", "finish_fit", "invert", "plan_fit"]
@@ -72,10 +73,11 @@ class Converter:
 
     Args:
         options: of the conversion.
+        refuse_unused: whether settings are refused that do not apply to a file; otherwise it is said.
     """
 
-    def __init__(self, options: ConvertOptions) -> None:
-        self._options, self._backends = options, FitBackends(options)
+    def __init__(self, options: ConvertOptions, *, refuse_unused: bool = True) -> None:
+        self._options, self._backends, self._refuse_unused = options, FitBackends(options), refuse_unused
 
     def __call__(self, path: Path, files: ResultFiles, chunks: Path) -> Converted:
         """Convert a file.
@@ -91,20 +93,27 @@ class Converter:
             SomaError: the file, or the backend that it needs, cannot be used.
             InputError: it holds no motion, or was fitted before with other settings.
         """
-        layout = _known_layout(path)
-        if layout not in FITTED:
-            return self._carry_over(path, layout, files)
-        options = self._options
-        body = open_body(path, layout, options, self._backends)
-        earlier = earlier_report(files.report, files.motion, fit_settings(path, layout, body, options))
+        layout, options = _known_layout(path), self._options
+        with heard() as said:
+            unused_settings(path, layout, options, refuse=self._refuse_unused)
+            if layout not in FITTED:
+                return self._carry_over(path, layout, files, said)
+            body = open_body(path, layout, options, self._backends)
+            earlier = earlier_report(files.report, files.motion, fit_settings(path, layout, body, options))
+            if earlier is None:
+                plan = plan_body(path, layout, body, options, files, chunks)
         if earlier is not None:
+            for warning in earlier.get("warnings", ()):
+                _log.warning("%s", warning)
             _refuse_failed(path, earlier, files.report)
             return Converted(report=earlier, files=files, earlier=True)
-        return _finished(FitJob(plan=plan_body(path, layout, body, options, files, chunks), body=body))
+        return _finished(FitJob(plan=replace(plan, warnings=tuple(said)), body=body))
 
-    def _carry_over(self, path: Path, layout: Layout, files: ResultFiles) -> Converted:
+    def _carry_over(self, path: Path, layout: Layout, files: ResultFiles, said: list[str]) -> Converted:
         """Write the rotations of a file on this skeleton as they are, in metres."""
-        motion = read(path, fps=self._options.fps, unit=self._options.unit)
+        options = self._options
+        motion = read(path, fps=options.fps, unit=options.unit, angles=options.angles)
+        say(path.name, of_motion(motion))
         write(motion, files.motion)
         report = {
             "settings": {"input": str(path.resolve()), "layout": layout, "fps": motion.fps},
@@ -112,6 +121,7 @@ class Converter:
             "convention": motion.convention,
             "identity": motion.identity.get("backend"),
             "rotations": "carried over as they are",
+            "warnings": said,
         }
         atomic_text(files.report, json.dumps(report, indent=2) + "\n")
         return Converted(report=report, files=files)
@@ -125,12 +135,7 @@ def _known_layout(path: Path) -> Layout:
     """
     layout = layout_of(path)
     if layout is None:
-        raise InputError(
-            str(path),
-            got="no motion under any key that is known",
-            expected="the keys of an AMASS, SAM 3D Body, kimodo or SOMA file",
-            fix="Vertices over time are what soma invert takes.",
-        )
+        raise no_motion(path)[0]
     return layout
 
 
@@ -150,14 +155,17 @@ def invert(source: str | Path, out: str | Path, *, options: InvertOptions | None
             written all the same.
     """
     source, out, options = expanded(source), Path(out), options or InvertOptions()
-    body, files = open_body(source, "vertices", options), ResultFiles.of_folder(out)
+    files = ResultFiles.of_folder(out)
+    with heard() as said:
+        body = open_body(source, "vertices", options)
     with body.posed.sequence as shown:
         _log.info(
             "%s: %d frames of %d vertices (%s) at %g fps",
             source.name, shown.frame_count, shown.vertex_count, body.posed.topology, shown.fps,
         )  # fmt: skip
-        plan = plan_body(source, "vertices", body, options, files, out / "chunks")
-        return _finished(FitJob(plan=plan, body=body))
+        with heard() as also:
+            plan = plan_body(source, "vertices", body, options, files, out / "chunks")
+        return _finished(FitJob(plan=replace(plan, warnings=(*said, *also)), body=body))
 
 
 def plan_fit(
@@ -184,9 +192,11 @@ def plan_fit(
         raise InputError(
             str(source), got=f"the layout {layout}", expected="a body to fit", fix="Convert or read it."
         )
-    body = open_body(source, layout, options)
-    with body.posed.sequence:
-        return plan_body(source, layout, body, options, ResultFiles.of_folder(out), out / "chunks")
+    with heard() as said:
+        body = open_body(source, layout, options)
+        with body.posed.sequence:
+            plan = plan_body(source, layout, body, options, ResultFiles.of_folder(out), out / "chunks")
+    return replace(plan, warnings=tuple(said))
 
 
 def finish_fit(plan: FitPlan) -> Converted:
@@ -207,7 +217,7 @@ def _finished(job: FitJob) -> Converted:
     for line in summary.as_text().splitlines() if vertices else ():
         _log.info("%s", line)
     report = _read_report(plan.files.report)
-    _refuse_failed(plan.source, report, plan.files.report, axes_known=not vertices)
+    _refuse_failed(plan.source, report, plan.files.report)
     return Converted(report=report, files=plan.files)
 
 
@@ -232,18 +242,15 @@ def earlier_report(file: Path, result: Path, settings: Mapping[str, Any]) -> dic
     return report
 
 
-def _refuse_failed(path: Path, report: Mapping[str, Any], file: Path, *, axes_known: bool = True) -> None:
-    """Refuse a fit that is none; where a body lies, readers say themselves that know a file's axes.
+def _refuse_failed(path: Path, report: Mapping[str, Any], file: Path) -> None:
+    """Refuse a fit that is none.
 
     Raises:
         SomaError: what is wrong with it.
     """
     found = report.get("diagnosis")
-    if not found or (axes_known and found["cause"] == "axis"):
-        return
-    if found["failed"]:
+    if found and found["failed"]:
         raise SomaError(f"{path}: {found['sentence']}; {file} has the figures.")
-    _log.warning("%s: %s", path.name, found["sentence"])
 
 
 def _read_report(path: Path) -> dict[str, Any]:

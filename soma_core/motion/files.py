@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -19,7 +20,7 @@ from soma_core.paths import expanded
 from soma_core.rig import load_canonical
 from soma_core.topology.frames import METRES
 
-__all__ = ["SUFFIXES", "Layout", "ResultFiles", "fingerprint", "layout_of", "read", "write"]
+__all__ = ["SUFFIXES", "Layout", "ResultFiles", "fingerprint", "layout_of", "no_motion", "read", "write"]
 
 Layout = Literal["soma", "kimodo", "amass", "sam3d"]
 
@@ -82,13 +83,49 @@ def layout_of(path: str | Path) -> Layout | None:
         return "soma" if "schema_version" in fields or {"poses", "transl"} <= {*fields.names} else None
 
 
-def read(path: str | Path, *, fps: float | None = None, unit: LengthUnit | str | None = None) -> Motion:
+_POSE_KEY = re.compile(
+    r"(^|_)(full)?poses?(_|$)|orient|thetas?$|rot_?mats?|quat|axis_?angle|rotvec|(^|_)joints(_3d|_pos|$)|smpl",
+    re.IGNORECASE,
+)
+_CAMERA_KEY = re.compile(r"(^|_)cam", re.IGNORECASE)
+_WANTED = (
+    "poses, or root_orient and pose_body, beside trans (AMASS); pred_vertices (SAM 3D Body); "
+    "local_rot_mats or global_rot_mats (kimodo); or poses beside transl (SOMA)"
+)
+
+
+def no_motion(path: Path) -> tuple[InputError, bool]:
+    """Why a file of no known layout is none, by its keys; and whether they are those of poses all the same.
+
+    Raises:
+        AssetError: the file is missing, damaged, a git-LFS pointer or no NPZ.
+    """
+    with open_npz(path) as fields:
+        names = fields.names
+    vertices = any(name == "vertices" or name.endswith("_vertices") for name in names)
+    takes = "vertices over time are what soma invert input=FILE takes"
+    return InputError(
+        str(path),
+        got=f"the keys {', '.join(names) or '(none)'}",
+        expected=_WANTED,
+        fix=f"{takes[0].upper()}{takes[1:]}." if vertices else f"Rename the keys in it; {takes}.",
+    ), any(_POSE_KEY.search(name) and not _CAMERA_KEY.search(name) for name in names)
+
+
+def read(
+    path: str | Path,
+    *,
+    fps: float | None = None,
+    unit: LengthUnit | str | None = None,
+    angles: Literal["rad", "deg"] | None = None,
+) -> Motion:
     """Read a motion on this skeleton: a file of this project, of the SOMA tools or of kimodo.
 
     Args:
         path: the file. What other skeletons move in is for :func:`convert`.
         fps: frame rate, where the file has none.
         unit: ``m``, ``cm`` or ``mm``; overrides the file's own.
+        angles: unit of rotation vectors; None for radians.
 
     Raises:
         AssetError: the file is missing, damaged, a git-LFS pointer or no NPZ.
@@ -100,7 +137,7 @@ def read(path: str | Path, *, fps: float | None = None, unit: LengthUnit | str |
         )
     metres = METRES[str(unit)] if unit else None
     name = next((name for name, length in METRES_PER_UNIT.items() if length == metres), None)
-    return read_motion(path, fps=fps, unit=name)
+    return read_motion(path, fps=fps, unit=name, angles=angles)
 
 
 def write(motion: Motion, path: str | Path) -> None:

@@ -19,8 +19,9 @@ from soma_core.io.vertex_sequence import UpAxis
 from soma_core.motion.chunks import FittedChunks
 from soma_core.motion.files import ResultFiles
 from soma_core.motion.native_errors import NativeErrors
+from soma_core.motion.posed_input import world_axes
 from soma_core.native import NativeFit, NativeTransfer
-from soma_core.topology.frames import METRES, native_to_canonical
+from soma_core.topology.frames import METRES
 
 __all__ = ["NativeTarget", "SmplTarget", "VertexTarget"]
 
@@ -98,9 +99,8 @@ class SmplTarget:
 
     def arrays(self, vertices: Tensor) -> dict[str, np.ndarray]:
         """Parameters of the frames, and statistics of the error."""
-        if self.up == "+z":  # the fit does not care which way a body is turned
-            turn = torch.as_tensor(native_to_canonical("+z", "-y")).to(vertices)
-            vertices = vertices @ turn
+        if self.up != "+y":  # the fit does not care which way a body is turned
+            vertices = vertices @ torch.as_tensor(world_axes(self.up)).to(vertices)
         found = self.fit(vertices, params=self.params)
         return {
             "rotations": found.rotations.float().cpu().numpy(),
@@ -118,7 +118,9 @@ class SmplTarget:
         betas = np.array((self.params or {}).get("betas", []))
         motion = SmplMotion(model=self.model, **columns, betas=betas, gender=self.gender, fps=fps, up=self.up)
         write_amass(
-            motion, files.motion, extra={"source": np.array(source), "up_axis": np.array(self.up[1:].upper())}
+            motion,
+            files.motion,
+            extra={"source": np.array(source), "up_axis": np.array(self.up.lstrip("+").upper())},
         )
         frames = {name: np.concatenate(list(_column(chunks, name))) for name in _PER_FRAME}
         atomic_write(files.frames, lambda path: np.savez_compressed(path, **frames))

@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, cast
 
 from soma_core.errors import InputError
+from soma_core.io.vertex_sequence import UpAxis
 from soma_core.options import (
+    AngleUnit,
+    Axes,
     BackendChoice,
     BodyGender,
     ConvertResult,
@@ -20,8 +24,16 @@ from soma_core.options import (
     Translation,
     Upward,
 )
+from soma_core.topology.frames import METRES
+
+if TYPE_CHECKING:
+    from soma_core.plugin.spec import Unit
 
 __all__ = ["ConvertOptions", "FitOptions", "InvertOptions", "SourceOptions"]
+
+
+SIGNED: dict[str, UpAxis] = {"y": "+y", "z": "+z", "-y": "-y", "-z": "-z"}
+"""Upward axes as readers take them, by their settings."""
 
 
 @dataclass(kw_only=True)
@@ -34,7 +46,8 @@ class SourceOptions(Options):
         inversion: how poses are found.
         fps: frames per second.
         unit: of lengths.
-        up: upward axis.
+        up: upward axis of the world.
+        axes: of the world by name, instead: ``camera`` has y down and z forward.
     """
 
     backend: BackendChoice | None = None
@@ -43,6 +56,24 @@ class SourceOptions(Options):
     fps: float | None = None
     unit: LengthUnit | None = None
     up: Upward | None = None
+    axes: Axes | None = None
+
+    @property
+    def upward(self) -> UpAxis | None:
+        """Upward axis with its sign, by either setting; None where neither is given."""
+        if self.axes is not None:
+            return "-y"
+        return None if self.up is None else SIGNED[str(self.up)]
+
+    @property
+    def unit_name(self) -> Unit | None:
+        """The unit as readers take it."""
+        return None if self.unit is None else cast("Unit", str(self.unit))
+
+    @property
+    def metres(self) -> float | None:
+        """Length of the unit [m]."""
+        return None if self.unit_name is None else METRES[self.unit_name]
 
 
 @dataclass(kw_only=True)
@@ -60,8 +91,13 @@ class FitOptions(ModelOptions, SourceOptions):
     picture: Picture = field(default_factory=lambda: Picture(frames=0))
 
     def __post_init__(self) -> None:
-        """Refuse a chunk of no frames."""
+        """Refuse a chunk of no frames, and two names of an axis that differ."""
         super().__post_init__()
+        if self.axes is not None and self.up not in (None, "-y"):
+            raise InputError(
+                "axes", got=f"{self.axes} beside up={self.up}", expected="one of the two",
+                fix="A camera's axes have up=-y.",
+            )  # fmt: skip
         if self.chunk < 1:
             raise InputError("chunk", got=self.chunk, expected="at least 1", fix="Try chunk=256.")
 
@@ -88,6 +124,7 @@ class ConvertOptions(FitOptions):
         result: of the way back; None: poses of SMPL models, vertices of others.
         gender: of SMPL models; None: that of the file.
         most_betas: how many of a file's shape coefficients are used; None: all.
+        angles: unit of a file's rotation vectors; None: radians.
         betas: shape coefficients of the model, on the way back; None: the body's own, or the nearest.
         translation: where the body stands, on the way back.
     """
@@ -96,6 +133,7 @@ class ConvertOptions(FitOptions):
     result: ConvertResult | None = None
     gender: BodyGender | None = None
     most_betas: int | None = None
+    angles: AngleUnit | None = None
     betas: list[float] | None = None
     translation: Translation = Translation.motion
 

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from soma_core.plugin.spec import Axis
     from soma_core.skeleton.identity import Identity
 
-__all__ = ["PosedInput"]
+__all__ = ["PosedInput", "world_axes"]
 
 _FORWARD: dict[str, Axis] = {
     "+y": "+z", "+z": "-y", "-y": "-z", "-z": "+y", "+x": "+z", "-x": "+z",
@@ -184,7 +184,8 @@ def _metres(sequence: VertexSequence, layer: SomaLayer, topology: Topology) -> f
     return METRES[layer.spec.unit] if topology == "native" else 1.0
 
 
-def _axes(up: UpAxis) -> np.ndarray:
+def world_axes(up: UpAxis) -> np.ndarray:
+    """Rotation (3, 3) from a world of which only the upward axis is known to +Y up, +Z forward."""
     return native_to_canonical(up, _FORWARD[up])
 
 
@@ -197,7 +198,7 @@ def _canonical_frame(sequence: VertexSequence) -> np.ndarray:
             expected="m, cm or mm",
             fix="Pass unit=m (or the true unit).",
         )
-    return sequence.metres * _axes(sequence.up or "+y")
+    return sequence.metres * world_axes(sequence.up or "+y")
 
 
 def _native_frame(sequence: VertexSequence, layer: SomaLayer) -> np.ndarray:
@@ -206,7 +207,7 @@ def _native_frame(sequence: VertexSequence, layer: SomaLayer) -> np.ndarray:
     scale = _metres(sequence, layer, "native") / METRES[spec.unit]
     if sequence.up in (None, spec.up):
         return scale * np.eye(3)
-    return scale * native_to_canonical(spec.up, spec.forward).T @ _axes(sequence.up)
+    return scale * native_to_canonical(spec.up, spec.forward).T @ world_axes(sequence.up)
 
 
 def _extent(vertices: np.ndarray) -> np.ndarray:

@@ -12,6 +12,7 @@ import numpy as np
 import torch
 from omegaconf import OmegaConf
 
+from soma_core.errors import InputError
 from soma_core.io.clip import skinned_clip
 from soma_core.io.gltf import write_gltf
 from soma_core.io.usd import write_usd
@@ -19,6 +20,7 @@ from soma_core.motion.animated import Animated, animate, load_clip
 from soma_core.motion.files import write
 from soma_core.motion.identities import backend_of, stored_identity
 from soma_core.motion.models import open_layer
+from soma_core.motion.questions import of_params, say
 from soma_core.view.picture import backend_colour, contact_sheet
 from soma_core.view.stage import Body
 
@@ -50,14 +52,23 @@ def run(config: DictConfig, output: Path) -> None:
 
         draw_gallery(options, output / "gallery.png")
         return
-    motion = load_clip(options.motion, fps=options.motion_fps, frames=options.frames)
+    motion = load_clip(
+        options.motion, fps=options.motion_fps, unit=options.motion_unit, frames=options.frames
+    )
     kept, chosen = options.identity_from == "motion", options.backend
+    if kept and chosen.params:
+        key, value = next(iter(chosen.params.items()))
+        raise InputError(
+            f"backend.params.{key}", got=value, expected="none with identity_from=motion",
+            fix=f"Leave backend.params.{key} out, or identity_from=motion.",
+        )  # fmt: skip
     name, own = chosen.name, chosen.options
     if kept:
         name, own = backend_of(motion), {**motion.identity.get("options", {}), **own}
     layer = open_layer(options, name, own)
     stored = dict(motion.identity) if kept else {"backend": layer.backend, "params": chosen.params}
     _log.info("%s: %d frames at %g fps", motion.source, motion.frame_count, motion.fps)
+    say(layer.backend, of_params(layer.spec, stored.get("params", {})))
     with torch.no_grad():
         identity = stored_identity(layer, stored)
         shown = _shown_frames(motion.frame_count, options.picture.frames)

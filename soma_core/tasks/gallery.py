@@ -50,7 +50,9 @@ def draw_gallery(options: AnimateConfig, path: Path) -> None:
     Raises:
         SomaError: no backend is usable, or pyvista is not installed.
     """
-    motion = load_clip(options.motion, fps=options.motion_fps, frames=options.frames)
+    motion = load_clip(
+        options.motion, fps=options.motion_fps, unit=options.motion_unit, frames=options.frames
+    )
     frame = motion.frame_count // 2 if options.motion else round(_POSE_SECOND * motion.fps)
     pose = _one_frame(motion, min(frame, motion.frame_count - 1))
     bodies = []

@@ -1,0 +1,283 @@
+"""Questions to what was read: what no body does, and the setting that mends it. None of them ends a run."""
+
+from __future__ import annotations
+
+import logging
+import threading
+from collections.abc import Collection, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from soma_core.errors import InputError
+from soma_core.inversion.diagnosis import leaning
+from soma_core.io.amass import SmplMotion
+from soma_core.io.motion import Motion
+from soma_core.io.rotation_vectors import degrees_doubt
+from soma_core.io.vertex_sequence import UpAxis
+from soma_core.motion.options import SIGNED, ConvertOptions
+from soma_core.motion.posed_input import world_axes
+from soma_core.plugin.spec import BackendSpec, Unit
+from soma_core.rig import load_canonical
+from soma_core.topology.frames import METRES
+
+__all__ = [
+    "Names",
+    "heard",
+    "of_motion",
+    "of_params",
+    "of_path",
+    "of_rate",
+    "of_smpl",
+    "say",
+    "unused_settings",
+]
+
+_log = logging.getLogger(__name__)
+
+_RATES = (2.0, 2000.0)
+"""Frame rates [1/s] of what moves: slow videos of a webcam, fast cameras; below 1/5 lies a frame time."""
+
+_FRAME_TIME = 0.2
+"""Longest time between frames of what is called a motion [s]."""
+
+_HIGH = 10.0
+"""Lowest height of the hips in a clip [m]: stairs, trees and trampolines begin on the ground. Along the
+ground a person may be anywhere."""
+
+_LOW, _NEAR = (0.0002, 0.02), 0.05
+"""Heights of hips [m] as they are in another unit, metres taken for millimetres or centimetres, and how far a
+body then is from the origin at most. A body that lies has its hips at 0.08 m; one that is kept at the origin,
+or measured from its first frame, has exact zeros or goes below."""
+
+_HIPS = (0.1, 3.0)
+"""Heights of hips [m]: from a newborn that lies to a jump."""
+
+_FAST, _SPAN, _USUAL = 20.0, 0.5, 12.5
+"""Speed [m/s] over half a second [s] that nobody reaches on foot; and that of sprinters, who come closest."""
+
+_RARE = 0.2
+"""Share of a clip that a leap from one recording to the next takes at most."""
+
+_SMALLER: tuple[Unit, ...] = ("cm", "mm")
+
+_LEGS = (0.1, 1.5)
+"""Thigh and shin together [m]: 0.15 of a newborn, 1.2 of the tallest."""
+
+_FAR = 0.5
+"""How far beyond its range a parameter is questioned, in widths of it: from 6 for coefficients in -3 to 3."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Names:
+    """What the settings are called that mend a reading; empty where there is none."""
+
+    unit: str = "unit"
+    fps: str = "fps"
+    ups: Collection[str] = field(default_factory=lambda: tuple(SIGNED))
+
+
+def say(source: str, doubts: Collection[str]) -> None:
+    """Warn of what is doubtful about a file."""
+    for doubt in doubts:
+        _log.warning("%s: %s", source, doubt)
+
+
+@contextmanager
+def heard() -> Iterator[list[str]]:
+    """Collect what this package warns of in this thread, for a report; handlers get it as before."""
+    said: list[str] = []
+    handler = logging.Handler(logging.WARNING)
+    here = threading.get_ident()
+
+    def note(record: logging.LogRecord) -> None:
+        if record.thread == here and record.getMessage() not in said:
+            said.append(record.getMessage())
+
+    handler.emit = note  # type: ignore[method-assign]
+    logger = logging.getLogger("soma_core")
+    logger.addHandler(handler)
+    try:
+        yield said
+    finally:
+        logger.removeHandler(handler)
+
+
+def of_smpl(motion: SmplMotion) -> list[str]:
+    """What is doubtful about a motion of the SMPL family: its angles, axes, lengths, speed and frame rate."""
+    degrees = degrees_doubt(motion.rotations)
+    if degrees:
+        return [degrees, *of_rate(motion.fps)]  # where the body points is not known
+    upward = Rotation.from_rotvec(motion.rotations[:, 0]).apply([0, 1, 0])
+    lies = _of_axes(upward, motion.up, Names().ups)
+    return of_rate(motion.fps) + (lies or of_path(motion.translation, motion.fps, up=motion.up, what="trans"))
+
+
+def of_motion(motion: Motion, names: Names | None = None) -> list[str]:
+    """The same about a motion on this skeleton, and the lengths of its legs where the file tells them."""
+    names = names or Names(ups=())
+    hips = motion.rotations[:, 0].astype(np.float64)
+    if motion.convention == "absolute_local":
+        hips = hips @ load_canonical("mid")[1].t_pose_world[1, :3, :3].T
+    lies = _of_axes(hips[:, :, 1], "+y", names.ups)
+    path = of_path(motion.translation, motion.fps, up="+y", what="the Hips", names=names)
+    return of_rate(motion.fps, names) + _of_legs(motion, names) + (lies or path)
+
+
+def of_rate(fps: float, names: Names | None = None) -> list[str]:
+    """What is doubtful about a frame rate: a frame time in its place, or in another unit."""
+    name = (names or Names()).fps
+    if fps <= _FRAME_TIME:
+        return [
+            f"{fps:.4g} frames a second would be one in {1 / fps:.3g} s; if that is a frame time, "
+            f"pass {name}={1 / fps:.6g}"
+        ]
+    if fps > _RATES[1]:
+        return [f"{fps:g} frames a second are more than cameras take; pass {name}=30 (the true rate)"]
+    return []
+
+
+def _of_axes(upward: np.ndarray, up: UpAxis, ups: Collection[str]) -> list[str]:
+    """Whether a body lies or stands on its head on the whole, by its upward directions (frames, 3)."""
+    axes = world_axes(up)
+    found = leaning(upward @ axes.T, axes)
+    if found is None:
+        return []
+    mend = (
+        f"pass up={found.along}" if found.along in ups else "the world of the file has not +y up, as it must"
+    )
+    return [f"{found.sentence}; if that is not its pose, {mend}"]
+
+
+def of_path(
+    places: np.ndarray, fps: float, *, up: UpAxis, what: str, names: Names | None = None
+) -> list[str]:
+    """What is doubtful about where a body is, and how fast it moves.
+
+    Args:
+        places: (frames, 3) of the hips [m].
+        fps: frames per second.
+        up: upward axis.
+        what: whose places these are.
+        names: of the settings that mend it.
+    """
+    names, places = names or Names(), np.asarray(places, np.float64)
+    height = (places @ world_axes(up).T)[:, 1]
+    speed, frame, share = _fastest(places, fps)
+    lowest, nearest = float(np.abs(height).min()), float(np.linalg.norm(places, axis=1).max())
+    told = []
+    if lowest > _HIGH and (height.min() > 0 or height.max() < 0):
+        side = "above" if height[0] > 0 else "below"
+        told.append(f"{what} is {lowest:.4g} m or more {side} the ground")
+    elif _LOW[0] < height.min() and height.max() < _LOW[1] and nearest < _NEAR:
+        return [
+            f"{what} is only {1e3 * float(np.median(height)):.3g} mm above the ground, which no body's is; "
+            f"pass {names.unit}=m, cm or mm as they are stored, unless they were divided twice"
+        ]
+    if speed > _FAST and share > _RARE:
+        told.append(f"{what} moves at up to {speed:,.4g} m/s")
+    elif speed > _FAST:
+        leap = (
+            f"{what} leaps at {speed:,.4g} m/s about frame {frame}; if two recordings follow each other, cut"
+        )
+        return [*_mended(told, lowest, speed, names), f"{leap} the file there"]
+    return _mended(told, lowest, speed, names)
+
+
+def _mended(told: list[str], height: float, speed: float, names: Names) -> list[str]:
+    """One sentence of what was found, with the unit that explains it, or the frame rate."""
+    if not told:
+        return []
+    high = [unit for unit in _SMALLER if _HIPS[0] < height * METRES[unit] < _HIPS[1]]
+    slow = [unit for unit in _SMALLER if speed * METRES[unit] < _USUAL]
+    units = (high if height > _HIGH else slow) or ["cm"]
+    rate = "" if height > _HIGH else f", and if the frame rate is wrong, {names.fps}=30 (the true rate)"
+    return [f"{' and '.join(told)}; if the lengths are in {units[0]}, pass {names.unit}={units[0]}{rate}"]
+
+
+def _fastest(places: np.ndarray, fps: float) -> tuple[float, int, float]:
+    """Largest speed [m/s] over half a second, where it is, and the share of the clip that is too fast."""
+    span = min(max(round(_SPAN * fps), 1), len(places) - 1)
+    if span < 1:
+        return 0.0, 0, 0.0
+    speeds = np.linalg.norm(places[span:] - places[:-span], axis=1) * fps / span
+    steps = np.linalg.norm(np.diff(places, axis=0), axis=1)
+    return float(speeds.max()), int(steps.argmax()) + 1, float((speeds > _FAST).mean())
+
+
+def _of_legs(motion: Motion, names: Names) -> list[str]:
+    """Whether the legs of a file's own skeleton are those of a person."""
+    skeleton = getattr(motion, "skeleton", None)
+    if skeleton is None:
+        return []
+    bones = [f"{side}{bone}" for side in ("Left", "Right") for bone in ("Shin", "Foot")]
+    lengths = np.linalg.norm([skeleton[motion.joint_names.index(name)] for name in bones], axis=1)
+    legs = float(lengths.sum() / 2)
+    if not np.isfinite(legs) or _LEGS[0] < legs < _LEGS[1]:
+        return []
+    fitting = [unit for unit, metres in METRES.items() if unit != "m" and _LEGS[0] < legs * metres < _LEGS[1]]
+    mend = (
+        f"pass {names.unit}={fitting[0]}" if fitting else f"pass {names.unit}=m, cm or mm as they are stored"
+    )
+    return [f"its legs are {legs:.3g} m long; if the lengths are in another unit, {mend}"]
+
+
+def of_params(spec: BackendSpec, params: Mapping[str, Any]) -> list[str]:
+    """Parameters of a body far outside the ranges that its backend declares."""
+    told = []
+    for parameter in spec.params:
+        if parameter.name not in params:
+            continue
+        low, high = parameter.range
+        values = np.asarray(params[parameter.name], np.float64).reshape(-1)
+        beyond = np.maximum(values - high, low - values)
+        if values.size and beyond.max() > _FAR * (high - low):
+            worst = values[int(beyond.argmax())]
+            meaning = f" ({parameter.description})" if parameter.description else ""
+            told.append(
+                f"{parameter.name}={worst:g} is far outside the range of {spec.name}, {low:g} to {high:g}"
+                f"{meaning}; `soma backends show {spec.name}` lists all ranges"
+            )
+    return told
+
+
+_APPLY: dict[str, frozenset[str]] = {
+    "gender": frozenset({"amass"}),
+    "most_betas": frozenset({"amass"}),
+    "angles": frozenset({"amass", "soma"}),
+    "up": frozenset({"amass", "sam3d"}),
+    "axes": frozenset({"amass", "sam3d"}),
+    "identity": frozenset({"sam3d"}),
+}
+"""Settings that not every file takes, and the layouts that do."""
+
+_LAYOUTS = frozenset({"soma", "kimodo", "amass", "sam3d"})
+
+
+def unused_settings(path: Path, layout: str, options: ConvertOptions, *, refuse: bool) -> None:
+    """Refuse settings that change nothing about a file of this layout, or say so.
+
+    Args:
+        path, layout: the file.
+        options: all that was asked for.
+        refuse: for one file; in a folder others may take a setting that this one does not.
+
+    Raises:
+        InputError: a setting that does not apply.
+    """
+    sought = None if options.identity.method == "known" else str(options.identity.method)
+    given: dict[str, object] = {name: getattr(options, name, None) for name in _APPLY}
+    given["identity"] = sought
+    for name, value in given.items():
+        if value is None or layout in _APPLY[name] or layout not in _LAYOUTS:
+            continue
+        if refuse:
+            raise InputError(
+                f"{path.name}: {name}", got=str(value), expected=f"none: a {layout} file has no use for it",
+                fix=f"Leave {name} out.",
+            )  # fmt: skip
+        say(path.name, [f"{name}={value} is not used: a {layout} file has no use for it"])
