@@ -37,6 +37,7 @@ __all__ = [
     "Picture",
     "PriorChoice",
     "Product",
+    "RotationZero",
     "Topology",
     "Translation",
     "Upward",
@@ -144,6 +145,13 @@ class Axes(StrEnum):
     """Axes of a file's world by name: a camera's have y down, and z forward, away from it."""
 
     camera = "camera"
+
+
+class RotationZero(StrEnum):
+    """What the rotations of a file on this skeleton are relative to."""
+
+    t_pose_relative = "t_pose_relative"
+    absolute_local = "absolute_local"
 
 
 class AngleUnit(StrEnum):

@@ -15,7 +15,7 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 
 from soma_core.config.overrides import literal_texts
-from soma_core.config.refusals import REFUSALS, check_backend_choice, in_our_words
+from soma_core.config.refusals import REFUSALS, check_backend_choice, in_our_words, with_settings
 from soma_core.config.run_folder import run_log, write_provenance
 from soma_core.config.schema import SCHEMAS, register_schemas
 from soma_core.config.searchpath import register_search_path
@@ -66,7 +66,7 @@ def run_task(
         except SomaError as error:
             if os.environ.get("SOMA_STRICT") == "1":
                 raise
-            report(error)
+            report(with_settings(error))
         else:
             report(folder)
         running.clear()

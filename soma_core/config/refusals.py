@@ -21,7 +21,7 @@ from soma_core.plugin.declaration import did_you_mean
 from soma_core.plugin.errors import BrokenBackendError
 from soma_core.plugin.registry import default_registry
 
-__all__ = ["REFUSALS", "check_backend_choice", "in_our_words"]
+__all__ = ["REFUSALS", "check_backend_choice", "in_our_words", "with_settings"]
 
 REFUSALS = (HydraException, InterpolationResolutionError, YAMLError, UnicodeError)
 """What composing a configuration may raise."""
@@ -29,6 +29,7 @@ REFUSALS = (HydraException, InterpolationResolutionError, YAMLError, UnicodeErro
 _SHOWN_KEYS = 16
 """A backend may have hundreds of parameters; an error message lists this many."""
 
+_PARAMETER = re.compile(r"params\['(?P<name>.+)'\]")
 _COMPOSING = re.compile(r"In '(?P<file>[^']+)': \w+ raised while composing config:\s*(?P<cause>[^\n]*)")
 
 
@@ -55,6 +56,18 @@ def in_our_words(error: Exception) -> SomaError:
         return _refused_value(error.__cause__)
     first, *rest = str(error).splitlines()
     return InputError("configuration", got=first, expected="key=value", fix=" ".join(rest) or "See --help")
+
+
+def with_settings(error: SomaError) -> SomaError:
+    """Name a parameter of the body by its setting, where an error has it as an argument of Python."""
+    found = _PARAMETER.fullmatch(error.argument) if isinstance(error, InputError) else None
+    if found is None or not isinstance(error, InputError):
+        return error
+    setting = f"backend.params.{found['name']}"
+    fix = (
+        error.fix if "soma backends show" in error.fix else f"Correct {setting}; see: soma backends show NAME"
+    )
+    return InputError(setting, got=error.got, expected=error.expected, fix=fix)
 
 
 def _unparsed(error: OverrideParseException) -> InputError:

@@ -59,7 +59,7 @@ def read_motion(
             "layout",
             got=f"the keys {', '.join(fields.names) or '(none)'}",
             expected="'poses' and 'transl' (SOMA), or 'global_rot_mats' (kimodo)",
-            fix="Convert the motion to the SOMA skeleton first.",
+            fix=f"soma convert input={fields.path} brings motions of other tools to this skeleton.",
         )
 
 

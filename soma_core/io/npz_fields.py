@@ -127,7 +127,8 @@ def say_overridden(path: Path, setting: str, *, given: float | str, own: float |
     else:
         same = abs(given - own) <= _SAME_RATE * own
     if not same:
-        _log.warning("%s: %s=%s is taken in place of the file's own, %s", path.name, setting, given, own)
+        told = [each if isinstance(each, str) else f"{each:g}" for each in (given, own)]
+        _log.warning("%s: %s=%s is taken in place of the file's own, %s", path.name, setting, *told)
 
 
 @contextmanager

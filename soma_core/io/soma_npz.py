@@ -186,7 +186,7 @@ def _convention(fields: NpzFields, convention: Convention | None) -> Convention:
             "absolute_pose",
             got=f"absolute_pose={not relative} {'with' if has_orient else 'without'} joint_orient",
             expected="joint_orient exactly when poses are T-pose-relative",
-            fix="Pass convention='t_pose_relative' or 'absolute_local' to read_motion.",
+            fix="Say which by soma convert convention=t_pose_relative or absolute_local.",
         )
     return "t_pose_relative" if relative else "absolute_local"
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import zipfile
 import zlib
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import IO, TypeVar
 
@@ -90,11 +90,11 @@ def open_npy(path: Path) -> ArraySequence:
         raise _damaged(path, error) from error
 
 
-def open_npz_vertices(path: Path) -> ArraySequence:
+def open_npz_vertices(path: Path, said: Collection[str] = ()) -> ArraySequence:
     """Open the vertices in an ``.npz``: the key ``vertices``, or the only array (frames, n, 3).
 
     ``fps``, ``unit`` (``meters``, ``centimeters``, ``millimeters``) and ``up_axis`` (``Y``, ``Z``) are read
-    where they are there.
+    where they are there, and not among those that are `said` already.
 
     Raises:
         AssetError: no NPZ file, or damaged.
@@ -102,8 +102,8 @@ def open_npz_vertices(path: Path) -> ArraySequence:
     """
     with open_npz(path) as fields:
         fps = fields.number("fps") if "fps" in fields else None
-        metres = _named(fields, "unit", _UNITS) if "unit" in fields else None
-        up = _named(fields, "up_axis", _AXES) if "up_axis" in fields else None
+        metres = _named(fields, "unit", _UNITS, "unit" in said)
+        up = _named(fields, "up_axis", _AXES, "up" in said)
     archive = zipfile.ZipFile(path)
     try:
         name, header = _vertex_member(path, archive)
@@ -116,15 +116,18 @@ def open_npz_vertices(path: Path) -> ArraySequence:
         archive.close()
 
 
-def _named(fields: NpzFields, key: str, known: Mapping[str, _Named]) -> _Named:
+def _named(fields: NpzFields, key: str, known: Mapping[str, _Named], said: bool) -> _Named | None:
+    """What a key says; None where it is not there, or another was said in place of one that is not known."""
+    if key not in fields:
+        return None
     value = fields.text(key)
     found = known.get(value) or known.get(value.upper())
-    if found is None:
+    if found is None and not said:
         raise fields.refuse(
             key,
             got=repr(value),
             expected=" or ".join(map(repr, known)),
-            fix=f"Correct the key '{key}' of the file.",
+            fix="Pass unit=m, cm or mm." if key == "unit" else "Pass up=y, z, -y or -z.",
         )
     return found
 

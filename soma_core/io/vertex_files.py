@@ -46,7 +46,7 @@ def open_vertex_sequence(
         InputError: a format or a layout that is not read, or a frame rate that is not positive.
     """
     path = expanded(path)
-    sequence = _open(path)
+    sequence = _open(path, [name for name, value in (("unit", unit), ("up", up)) if value is not None])
     metres = sequence.metres
     length = next((name for name, each in METRES.items() if each == metres), metres and f"{metres:g} m")
     asked = {"fps": (fps, sequence.fps), "unit": (unit, length), "up": (up, sequence.up)}
@@ -68,7 +68,7 @@ def open_vertex_sequence(
     return sequence
 
 
-def _open(path: Path) -> VertexSequence:
+def _open(path: Path, said: list[str]) -> VertexSequence:
     if path.is_dir():
         return FolderSequence(path)
     refuse_unreadable(path)
@@ -80,4 +80,4 @@ def _open(path: Path) -> VertexSequence:
             expected=f"{', '.join(_READERS)} or a folder of .obj or .ply files",
             fix="Export the vertices in one of these formats.",
         )
-    return reader(path)
+    return reader(path, said) if reader is open_npz_vertices else reader(path)

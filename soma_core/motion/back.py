@@ -87,7 +87,9 @@ class BackConverter:
             )
         options = self._options
         with heard() as said:
-            motion = read(path, fps=options.fps, unit=options.unit, angles=options.angles)
+            motion = read(
+                path, fps=options.fps, unit=options.unit, angles=options.angles, convention=options.convention
+            )
             layer, stored = self._body(path, motion)
             target = self._target(stored)
             say(path.name, of_motion(motion) + of_params(layer.spec, stored.get("params", {})))
@@ -144,7 +146,7 @@ class BackConverter:
         if name not in SMPL_JOINTS:
             raise InputError(
                 "result", got=f"poses of {name}", expected=f"poses of one of {', '.join(SMPL_JOINTS)}",
-                fix="Pass result=vertices; in Python, NativeFit gives the poses of other skinned models.",
+                fix="Pass result=vertices.",
             )  # fmt: skip
         own = stored if stored["backend"] == name and "rest" not in stored else {}
         kept = str(own.get("options", {}).get("gender", "neutral"))

@@ -112,7 +112,9 @@ class Converter:
     def _carry_over(self, path: Path, layout: Layout, files: ResultFiles, said: list[str]) -> Converted:
         """Write the rotations of a file on this skeleton as they are, in metres."""
         options = self._options
-        motion = read(path, fps=options.fps, unit=options.unit, angles=options.angles)
+        motion = read(
+            path, fps=options.fps, unit=options.unit, angles=options.angles, convention=options.convention
+        )
         say(path.name, of_motion(motion))
         write(motion, files.motion)
         report = {

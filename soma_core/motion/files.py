@@ -10,7 +10,7 @@ from typing import Literal
 
 from soma_core.errors import InputError
 from soma_core.io.amass import holds_smpl_motion
-from soma_core.io.motion import Motion
+from soma_core.io.motion import Convention, Motion
 from soma_core.io.motion_files import read_motion, write_motion
 from soma_core.io.npz_fields import open_npz
 from soma_core.io.sam3d import SAM3D_SUFFIXES
@@ -118,6 +118,7 @@ def read(
     fps: float | None = None,
     unit: LengthUnit | str | None = None,
     angles: Literal["rad", "deg"] | None = None,
+    convention: Convention | None = None,
 ) -> Motion:
     """Read a motion on this skeleton: a file of this project, of the SOMA tools or of kimodo.
 
@@ -126,6 +127,7 @@ def read(
         fps: frame rate, where the file has none.
         unit: ``m``, ``cm`` or ``mm``; overrides the file's own.
         angles: unit of rotation vectors; None for radians.
+        convention: what zero means; overrides the file's own.
 
     Raises:
         AssetError: the file is missing, damaged, a git-LFS pointer or no NPZ.
@@ -137,7 +139,7 @@ def read(
         )
     metres = METRES[str(unit)] if unit else None
     name = next((name for name, length in METRES_PER_UNIT.items() if length == metres), None)
-    return read_motion(path, fps=fps, unit=name, angles=angles)
+    return read_motion(path, fps=fps, unit=name, angles=angles, convention=convention)
 
 
 def write(motion: Motion, path: str | Path) -> None:

@@ -238,7 +238,7 @@ class FitJob:
             doubts.append(found.sentence)
         if plan.layout != "amass" and valid.sum() > 1:  # its path was asked about before the fit
             path = np.concatenate([path for (path,) in plan.chunks.load_all("translation")])[valid]
-            doubts += of_path(path, plan.settings["fps"], up="+y", what="the body")
+            doubts += of_path(path, plan.settings["fps"], up="+y", what="the fit")
         say(plan.source.name, doubts)
 
     def _diagnosis(self, errors: np.ndarray) -> Diagnosis | None:

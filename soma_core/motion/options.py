@@ -20,6 +20,7 @@ from soma_core.options import (
     ModelOptions,
     Options,
     Picture,
+    RotationZero,
     Topology,
     Translation,
     Upward,
@@ -125,6 +126,7 @@ class ConvertOptions(FitOptions):
         gender: of SMPL models; None: that of the file.
         most_betas: how many of a file's shape coefficients are used; None: all.
         angles: unit of a file's rotation vectors; None: radians.
+        convention: zero of the rotations in a file on this skeleton; None: as the file says.
         betas: shape coefficients of the model, on the way back; None: the body's own, or the nearest.
         translation: where the body stands, on the way back.
     """
@@ -134,6 +136,7 @@ class ConvertOptions(FitOptions):
     gender: BodyGender | None = None
     most_betas: int | None = None
     angles: AngleUnit | None = None
+    convention: RotationZero | None = None
     betas: list[float] | None = None
     translation: Translation = Translation.motion
 

@@ -57,11 +57,12 @@ or measured from its first frame, has exact zeros or goes below."""
 _HIPS = (0.1, 3.0)
 """Heights of hips [m]: from a newborn that lies to a jump."""
 
-_FAST, _SPAN, _USUAL = 20.0, 0.5, 12.5
-"""Speed [m/s] over half a second [s] that nobody reaches on foot; and that of sprinters, who come closest."""
+_SPAN, _LEAP, _USUAL = 0.5, 10.0, 12.5
+"""Half a second [s], how far nobody gets in it or in less [m], and the speed of the fastest sprinters [m/s]."""
 
-_RARE = 0.2
-"""Share of a clip that a leap from one recording to the next takes at most."""
+_AT_ONCE, _FEW = 0.6, 5
+"""Share of that way in one step that makes it a leap, as from one recording to the next, and the frames of a
+clip in which that can be told."""
 
 _SMALLER: tuple[Unit, ...] = ("cm", "mm")
 
@@ -124,7 +125,7 @@ def of_motion(motion: Motion, names: Names | None = None) -> list[str]:
     if motion.convention == "absolute_local":
         hips = hips @ load_canonical("mid")[1].t_pose_world[1, :3, :3].T
     lies = _of_axes(hips[:, :, 1], "+y", names.ups)
-    path = of_path(motion.translation, motion.fps, up="+y", what="the Hips", names=names)
+    path = of_path(motion.translation, motion.fps, up="+y", what="the path of the Hips", names=names)
     return of_rate(motion.fps, names) + _of_legs(motion, names) + (lies or path)
 
 
@@ -167,28 +168,26 @@ def of_path(
     """
     names, places = names or Names(), np.asarray(places, np.float64)
     height = (places @ world_axes(up).T)[:, 1]
-    speed, frame, share = _fastest(places, fps)
+    speed, leap = _fastest(places, fps)
     lowest, nearest = float(np.abs(height).min()), float(np.linalg.norm(places, axis=1).max())
     told = []
     if lowest > _HIGH and (height.min() > 0 or height.max() < 0):
         side = "above" if height[0] > 0 else "below"
-        told.append(f"{what} is {lowest:.4g} m or more {side} the ground")
+        told.append(f"puts the body {lowest:.4g} m or more {side} the ground")
     elif _LOW[0] < height.min() and height.max() < _LOW[1] and nearest < _NEAR:
         return [
-            f"{what} is only {1e3 * float(np.median(height)):.3g} mm above the ground, which no body's is; "
-            f"pass {names.unit}=m, cm or mm as they are stored, unless they were divided twice"
+            f"{what} puts the hips {1e3 * float(np.median(height)):.3g} mm above the ground, where no body has "
+            f"them; pass {names.unit}=m, cm or mm as they are stored, unless they were divided twice"
         ]
-    if speed > _FAST and share > _RARE:
-        told.append(f"{what} moves at up to {speed:,.4g} m/s")
-    elif speed > _FAST:
-        leap = (
-            f"{what} leaps at {speed:,.4g} m/s about frame {frame}; if two recordings follow each other, cut"
-        )
-        return [*_mended(told, lowest, speed, names), f"{leap} the file there"]
-    return _mended(told, lowest, speed, names)
+    if leap is not None:
+        cut = "if two recordings follow each other there, cut the file"
+        return [*_mended(what, told, lowest, 0.0, names), f"{what} leaps at frame {leap}; {cut}"]
+    if speed:
+        told.append(f"moves it at up to {speed:,.4g} m/s")
+    return _mended(what, told, lowest, speed, names)
 
 
-def _mended(told: list[str], height: float, speed: float, names: Names) -> list[str]:
+def _mended(what: str, told: list[str], height: float, speed: float, names: Names) -> list[str]:
     """One sentence of what was found, with the unit that explains it, or the frame rate."""
     if not told:
         return []
@@ -196,17 +195,23 @@ def _mended(told: list[str], height: float, speed: float, names: Names) -> list[
     slow = [unit for unit in _SMALLER if speed * METRES[unit] < _USUAL]
     units = (high if height > _HIGH else slow) or ["cm"]
     rate = "" if height > _HIGH else f", and if the frame rate is wrong, {names.fps}=30 (the true rate)"
-    return [f"{' and '.join(told)}; if the lengths are in {units[0]}, pass {names.unit}={units[0]}{rate}"]
+    return [
+        f"{what} {' and '.join(told)}; if the lengths are in {units[0]}, pass {names.unit}={units[0]}{rate}"
+    ]
 
 
-def _fastest(places: np.ndarray, fps: float) -> tuple[float, int, float]:
-    """Largest speed [m/s] over half a second, where it is, and the share of the clip that is too fast."""
+def _fastest(places: np.ndarray, fps: float) -> tuple[float, int | None]:
+    """Speed [m/s] over half a second that nobody reaches, or 0; and the frame of a leap that makes it so."""
     span = min(max(round(_SPAN * fps), 1), len(places) - 1)
     if span < 1:
-        return 0.0, 0, 0.0
-    speeds = np.linalg.norm(places[span:] - places[:-span], axis=1) * fps / span
+        return 0.0, None
+    far = float(np.linalg.norm(places[span:] - places[:-span], axis=1).max())
+    if far <= _LEAP:
+        return 0.0, None
     steps = np.linalg.norm(np.diff(places, axis=0), axis=1)
-    return float(speeds.max()), int(steps.argmax()) + 1, float((speeds > _FAST).mean())
+    leap = int(steps.argmax()) + 1
+    at_once = len(places) >= _FEW and steps[leap - 1] > _AT_ONCE * far
+    return far * fps / span, leap if at_once else None
 
 
 def _of_legs(motion: Motion, names: Names) -> list[str]:
@@ -249,6 +254,7 @@ _APPLY: dict[str, frozenset[str]] = {
     "gender": frozenset({"amass"}),
     "most_betas": frozenset({"amass"}),
     "angles": frozenset({"amass", "soma"}),
+    "convention": frozenset({"soma"}),
     "up": frozenset({"amass", "sam3d"}),
     "axes": frozenset({"amass", "sam3d"}),
     "identity": frozenset({"sam3d"}),
@@ -271,13 +277,13 @@ def unused_settings(path: Path, layout: str, options: ConvertOptions, *, refuse:
     """
     sought = None if options.identity.method == "known" else str(options.identity.method)
     given: dict[str, object] = {name: getattr(options, name, None) for name in _APPLY}
-    given["identity"] = sought
+    given["identity"] = sought and "unknown"
     for name, value in given.items():
         if value is None or layout in _APPLY[name] or layout not in _LAYOUTS:
             continue
         if refuse:
             raise InputError(
-                f"{path.name}: {name}", got=str(value), expected=f"none: a {layout} file has no use for it",
+                f"{path.name}: {name}", got=value, expected=f"none: a {layout} file has no use for it",
                 fix=f"Leave {name} out.",
             )  # fmt: skip
         say(path.name, [f"{name}={value} is not used: a {layout} file has no use for it"])
