@@ -91,7 +91,7 @@ class FreeParameters:
                 "free",
                 got="no parameter",
                 expected="at least one that may change",
-                fix="Name some, or fit without the backend: identity.method=unpose, method='unpose' in Python.",
+                fix="Name some in free, or fit without the backend by the method unpose.",
             )
         return [declared[name] for name in dict.fromkeys(names)]
 

@@ -224,8 +224,7 @@ def _rate(fields: NpzFields, frames: int, fps: float | None) -> float:
     """The frame rate that is asked for, else the file's; a warning where the file contradicts either."""
     found = {key: fields.number(key) for key in _RATES if key in fields}
     if fps is not None:
-        for own in found.values():
-            say_overridden(fields.path, "fps", given=float(fps), own=own)
+        say_overridden(fields.path, "fps", given=float(fps), own=next(iter(found.values()), float(fps)))
         return float(fps)
     seconds = fields.number(_SECONDS) if _SECONDS in fields else 0.0
     key = next((key for key in found if _lasts(frames, found[key], seconds)), next(iter(found), None))

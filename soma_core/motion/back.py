@@ -92,9 +92,10 @@ class BackConverter:
             )
             layer, stored = self._body(path, motion)
             target = self._target(stored)
-            say(path.name, of_motion(motion) + of_params(layer.spec, stored.get("params", {})))
+            own = "" if options.backend is None else "backend.params."
+            say(path.name, of_motion(motion) + of_params(layer.spec, stored.get("params", {}), setting=own))
             if isinstance(target, SmplTarget) and options.betas is not None:
-                say(path.name, of_params(target.fit.spec, target.params or {}))
+                say(path.name, of_params(target.fit.spec, target.params or {}, setting=""))
         settings = {
             "input": str(path.resolve()), "layout": layout, "fps": motion.fps, "body": stored["backend"],
             "body_params": stored.get("params"), "translation": str(self._options.translation),

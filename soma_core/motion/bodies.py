@@ -141,7 +141,7 @@ def _smpl_body(path: Path, options: ConvertOptions, backends: FitBackends) -> Sh
         search={},
         facts={"up": motion.up, **_units(options)},
         licence=f"that of {path.name}; body model: {backend.layer.spec.licence}",
-        doubts=tuple(of_smpl(motion) + of_params(backend.layer.spec, params)),
+        doubts=tuple(of_smpl(motion) + of_params(backend.layer.spec, params, setting="")),
     )
 
 

@@ -28,8 +28,9 @@ _FORWARD: dict[str, Axis] = {
 _NEARBY = 4
 """How many frames are looked at for one without gaps."""
 
-_SAME_SIZE = 3.0
-"""A body curls up to half its extent; three times more or less is another unit."""
+_SAME_SIZE, _OTHER_AGE = 3.0, 5.0
+"""A body curls up to half its extent; three times more or less is another unit, if there is one that fits, or
+an adult in place of a newborn, and five times no body."""
 
 
 class PosedInput:
@@ -109,7 +110,7 @@ class PosedInput:
         and a fit says so.
 
         Raises:
-            InputError: no frame among the first ones is usable, or the size is off by more than threefold.
+            InputError: another unit fits where the size is off threefold, or none where it is off fivefold.
         """
         unit = METRES[layer.spec.unit] if self.topology == "native" else 1.0
         expected = _extent(identity.fitted_rest[:1].detach().cpu().double().numpy())[0]
@@ -120,13 +121,17 @@ class PosedInput:
         told = _metres(self.sequence, layer, self.topology)
         name = next((unit for unit, metres in METRES.items() if metres == told), f"units of {told:g} m")
         fitting = min(METRES, key=lambda name: abs(np.log(sizes[0] / told * METRES[name] / expected)))
-        if fitting == name:
+        off = abs(np.log(sizes[0] / expected))
+        close = abs(np.log(sizes[0] / told * METRES[fitting] / expected)) < np.log(_SAME_SIZE)
+        if not close and off < np.log(_OTHER_AGE):
             return
+        mend = f"If the file is in {fitting}, pass unit={fitting}"
+        other = f"No unit of {', '.join(METRES)} fits: look at backend= and its parameters, or at the export's scale"
         raise InputError(
             str(self.sequence.path),
             got=f"a body {sizes[0] / expected:.3g} times as large as its identity, for lengths in {name}",
             expected="about the same size",
-            fix=f"If the file is in {fitting}, pass unit={fitting}.",
+            fix=f"{mend if close else other}.",
         )
 
 

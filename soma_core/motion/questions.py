@@ -58,11 +58,14 @@ _HIPS = (0.1, 3.0)
 """Heights of hips [m]: from a newborn that lies to a jump."""
 
 _SPAN, _LEAP, _USUAL = 0.5, 10.0, 12.5
-"""Half a second [s], how far nobody gets in it or in less [m], and the speed of the fastest sprinters [m/s]."""
+"""Half a second [s], how far nobody gets in it or in less [m], and the speed of the best sprinters [m/s]."""
 
 _AT_ONCE, _FEW = 0.6, 5
 """Share of that way in one step that makes it a leap, as from one recording to the next, and the frames of a
 clip in which that can be told."""
+
+_STILL = 0.002
+"""Speed [m/s] below which hips do not stay, of a person who stands; 0 is that of a single pose."""
 
 _SMALLER: tuple[Unit, ...] = ("cm", "mm")
 
@@ -168,36 +171,40 @@ def of_path(
     """
     names, places = names or Names(), np.asarray(places, np.float64)
     height = (places @ world_axes(up).T)[:, 1]
-    speed, leap = _fastest(places, fps)
-    lowest, nearest = float(np.abs(height).min()), float(np.linalg.norm(places, axis=1).max())
-    told = []
-    if lowest > _HIGH and (height.min() > 0 or height.max() < 0):
-        side = "above" if height[0] > 0 else "below"
-        told.append(f"puts the body {lowest:.4g} m or more {side} the ground")
-    elif _LOW[0] < height.min() and height.max() < _LOW[1] and nearest < _NEAR:
+    lowest, furthest = float(np.abs(height).min()), float(np.linalg.norm(places, axis=1).max())
+    if _LOW[0] < height.min() and height.max() < _LOW[1] and furthest < _NEAR:
         return [
-            f"{what} puts the hips {1e3 * float(np.median(height)):.3g} mm above the ground, where no body has "
-            f"them; pass {names.unit}=m, cm or mm as they are stored, unless they were divided twice"
+            f"{what} puts the hips {1e3 * float(np.median(height)):.3g} mm above the ground, where none are; "
+            f"pass {names.unit}=m, cm or mm as they are stored, unless they were divided twice"
         ]
+    told, units = [], []
+    if lowest > _HIGH and (height.min() > 0 or height.max() < 0):
+        units = _units_of_height(lowest, _pace(places, fps))
+        side = "above" if height[0] > 0 else "below"
+        told = [f"puts the body {lowest:.4g} m or more {side} the ground"] if units else []
+    speed, leap = _fastest(places, fps)
+    if speed and leap is None:
+        told.append(f"moves it at up to {speed:,.4g} m/s")
+    rate = "" if units else f", and if the frame rate is wrong, {names.fps}=30 (the true rate)"
+    units = units or [unit for unit in _SMALLER if speed * METRES[unit] < _USUAL] or ["cm"]
+    mend = f"if the lengths are in {units[0]}, pass {names.unit}={units[0]}{rate}"
+    found = [f"{what} {' and '.join(told)}; {mend}"] if told else []
     if leap is not None:
         cut = "if two recordings follow each other there, cut the file"
-        return [*_mended(what, told, lowest, 0.0, names), f"{what} leaps at frame {leap}; {cut}"]
-    if speed:
-        told.append(f"moves it at up to {speed:,.4g} m/s")
-    return _mended(what, told, lowest, speed, names)
+        found.append(f"{what} leaps at frame {leap}; {cut}")
+    return found
 
 
-def _mended(what: str, told: list[str], height: float, speed: float, names: Names) -> list[str]:
-    """One sentence of what was found, with the unit that explains it, or the frame rate."""
-    if not told:
-        return []
-    high = [unit for unit in _SMALLER if _HIPS[0] < height * METRES[unit] < _HIPS[1]]
-    slow = [unit for unit in _SMALLER if speed * METRES[unit] < _USUAL]
-    units = (high if height > _HIGH else slow) or ["cm"]
-    rate = "" if height > _HIGH else f", and if the frame rate is wrong, {names.fps}=30 (the true rate)"
-    return [
-        f"{what} {' and '.join(told)}; if the lengths are in {units[0]}, pass {names.unit}={units[0]}{rate}"
-    ]
+def _pace(places: np.ndarray, fps: float) -> float:
+    """Usual speed from frame to frame [m/s]; 0 for a single frame."""
+    steps = np.linalg.norm(np.diff(places, axis=0), axis=1)
+    return float(np.median(steps)) * fps if len(steps) else 0.0
+
+
+def _units_of_height(height: float, pace: float) -> list[Unit]:
+    """Units in which a height is one of hips; none where a body would move less than a living one."""
+    units = [unit for unit in _SMALLER if _HIPS[0] < height * METRES[unit] < _HIPS[1]] or ["cm"]
+    return [unit for unit in units if pace == 0 or pace * METRES[unit] > _STILL]
 
 
 def _fastest(places: np.ndarray, fps: float) -> tuple[float, int | None]:
@@ -231,20 +238,23 @@ def _of_legs(motion: Motion, names: Names) -> list[str]:
     return [f"its legs are {legs:.3g} m long; if the lengths are in another unit, {mend}"]
 
 
-def of_params(spec: BackendSpec, params: Mapping[str, Any]) -> list[str]:
-    """Parameters of a body far outside the ranges that its backend declares."""
+def of_params(spec: BackendSpec, params: Mapping[str, Any], *, setting: str = "backend.params.") -> list[str]:
+    """Parameters of a body far outside the ranges that its backend declares, called as `setting` has them."""
     told = []
     for parameter in spec.params:
         if parameter.name not in params:
             continue
         low, high = parameter.range
-        values = np.asarray(params[parameter.name], np.float64).reshape(-1)
+        try:
+            values = np.asarray(params[parameter.name], np.float64).reshape(-1)
+        except (TypeError, ValueError):
+            continue  # no numbers, which the backend refuses
         beyond = np.maximum(values - high, low - values)
         if values.size and beyond.max() > _FAR * (high - low):
             worst = values[int(beyond.argmax())]
             meaning = f" ({parameter.description})" if parameter.description else ""
             told.append(
-                f"{parameter.name}={worst:g} is far outside the range of {spec.name}, {low:g} to {high:g}"
+                f"{setting}{parameter.name}={worst:g} is far outside the range of {spec.name}, {low:g} to {high:g}"
                 f"{meaning}; `soma backends show {spec.name}` lists all ranges"
             )
     return told

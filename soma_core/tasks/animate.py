@@ -68,7 +68,10 @@ def run(config: DictConfig, output: Path) -> None:
     layer = open_layer(options, name, own)
     stored = dict(motion.identity) if kept else {"backend": layer.backend, "params": chosen.params}
     _log.info("%s: %d frames at %g fps", motion.source, motion.frame_count, motion.fps)
-    say(layer.backend, of_params(layer.spec, stored.get("params", {})))
+    say(
+        layer.backend,
+        of_params(layer.spec, stored.get("params", {}), setting="" if kept else "backend.params."),
+    )
     with torch.no_grad():
         identity = stored_identity(layer, stored)
         shown = _shown_frames(motion.frame_count, options.picture.frames)
