@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 from soma_core.io.joint_order import KIMODO_30_JOINTS, USER_JOINTS, nearest_ancestors
 from soma_core.io.motion import Motion
 from soma_core.io.npz_fields import NpzFields, check_rotations
-from soma_core.topology.frames import METRES_PER_UNIT
+from soma_core.topology.frames import ANY_UNIT
 
 __all__ = ["KIMODO_FPS", "read_kimodo_npz"]
 
@@ -44,7 +44,7 @@ def read_kimodo_npz(fields: NpzFields, *, fps: float | None, unit: str | None = 
             rotations[:, USER_JOINTS.index(name)] = local[:, index]
     return Motion(
         rotations=rotations,
-        translation=_hips(fields, frames, count) * METRES_PER_UNIT[unit or "meters"],
+        translation=_hips(fields, frames, count) * ANY_UNIT[unit or "m"],
         fps=KIMODO_FPS if fps is None else float(fps),
         joint_names=USER_JOINTS,
         source=f"kimodo motion {fields.path.name}",

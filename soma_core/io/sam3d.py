@@ -235,12 +235,12 @@ def _check(path: Path, found: Mapping[str, np.ndarray]) -> None:
     edges = np.ptp(found[_VERTICES], axis=1).max(axis=1)
     size, (low, high) = float(np.median(edges)), _SIZES
     if not low <= size <= high:
-        centimetres = low <= size / 100 <= high
+        unit = next((name for name, metres in METRES.items() if low <= size * metres <= high), None)
         raise InputError(
             f"{path}: {_VERTICES}",
-            got=f"a body of {size:.4g}" + (", as in centimetres" if centimetres else ""),
-            expected=f"metres, {low:g} to {high:g}",
-            fix=f"Pass unit={'cm' if centimetres else 'm, cm or mm, as they are stored'}.",
+            got=f"a body of {size:.4g} m" + (f", as of a file in {unit}" if unit else ""),
+            expected=f"{low:g} to {high:g} m",
+            fix=f"Pass unit={unit or 'm, cm or mm, as they are stored'}.",
         )
 
 

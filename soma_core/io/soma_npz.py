@@ -13,7 +13,7 @@ from soma_core.io.joint_order import USER_JOINTS
 from soma_core.io.motion import Convention, Motion
 from soma_core.io.npz_fields import NpzFields, check_rotations, say_overridden
 from soma_core.io.rotation_vectors import degrees_doubt, in_radians
-from soma_core.topology.frames import METRES_PER_UNIT
+from soma_core.topology.frames import ANY_UNIT, METRES_PER_UNIT
 
 __all__ = ["METRES_PER_UNIT", "SCHEMA_VERSION", "read_soma_npz"]
 
@@ -145,17 +145,17 @@ def _check_root(fields: NpzFields, root: np.ndarray) -> None:
 
 def _metres(fields: NpzFields, unit: str | None) -> float:
     own = fields.text("unit", "")
-    if unit is not None and own:
+    if unit is not None and own and ANY_UNIT.get(own) != ANY_UNIT.get(unit):
         say_overridden(fields.path, "unit", given=unit, own=own)
     name = unit if unit is not None else own
-    if name not in METRES_PER_UNIT:
+    if name not in ANY_UNIT:
         raise fields.refuse(
             "unit",
             got=repr(name) if name else "no unit",
             expected=" or ".join(map(repr, METRES_PER_UNIT)),
             fix="Pass unit=m, cm or mm (motion_unit= to soma animate).",
         )
-    return METRES_PER_UNIT[name]
+    return ANY_UNIT[name]
 
 
 def _frame_rate(fields: NpzFields, fps: float | None) -> float:

@@ -14,12 +14,11 @@ from soma_core.errors import AssetError, InputError, SomaError
 from soma_core.io.npz_fields import NpzFields, open_npz
 from soma_core.io.vertex_sequence import UpAxis, VertexSequence
 from soma_core.npz import ArrayHeader, read_array_header
-from soma_core.topology.frames import METRES, METRES_PER_UNIT
+from soma_core.topology.frames import ANY_UNIT
 
 __all__ = ["ArraySequence", "open_npy", "open_npz_vertices"]
 
 _KEY = "vertices"
-_UNITS = METRES_PER_UNIT | {str(unit): metres for unit, metres in METRES.items()}
 _AXES: dict[str, UpAxis] = {"Y": "+y", "Z": "+z", "-Y": "-y", "-Z": "-z"}
 _Named = TypeVar("_Named")
 _DAMAGE = (ValueError, EOFError, OSError, RuntimeError, MemoryError, zipfile.BadZipFile, zlib.error)
@@ -102,7 +101,7 @@ def open_npz_vertices(path: Path, said: Collection[str] = ()) -> ArraySequence:
     """
     with open_npz(path) as fields:
         fps = fields.number("fps") if "fps" in fields else None
-        metres = _named(fields, "unit", _UNITS, "unit" in said)
+        metres = _named(fields, "unit", ANY_UNIT, "unit" in said)
         up = _named(fields, "up_axis", _AXES, "up" in said)
     archive = zipfile.ZipFile(path)
     try:

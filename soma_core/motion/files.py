@@ -14,7 +14,6 @@ from soma_core.io.motion import Convention, Motion
 from soma_core.io.motion_files import read_motion, write_motion
 from soma_core.io.npz_fields import open_npz
 from soma_core.io.sam3d import SAM3D_SUFFIXES
-from soma_core.io.soma_npz import METRES_PER_UNIT
 from soma_core.options import LengthUnit
 from soma_core.paths import expanded
 from soma_core.rig import load_canonical
@@ -137,8 +136,7 @@ def read(
         raise InputError(
             "unit", got=repr(unit), expected=f"one of {', '.join(METRES)}", fix="Correct the name."
         )
-    metres = METRES[str(unit)] if unit else None
-    name = next((name for name, length in METRES_PER_UNIT.items() if length == metres), None)
+    name = None if unit is None else str(unit)
     return read_motion(path, fps=fps, unit=name, angles=angles, convention=convention)
 
 

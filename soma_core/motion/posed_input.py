@@ -120,13 +120,13 @@ class PosedInput:
             return
         told = _metres(self.sequence, layer, self.topology)
         name = next((unit for unit, metres in METRES.items() if metres == told), f"units of {told:g} m")
-        fitting = min(METRES, key=lambda name: abs(np.log(sizes[0] / told * METRES[name] / expected)))
-        off = abs(np.log(sizes[0] / expected))
-        close = abs(np.log(sizes[0] / told * METRES[fitting] / expected)) < np.log(_SAME_SIZE)
-        if not close and off < np.log(_OTHER_AGE):
+        off = {unit: abs(np.log(sizes[0] / told * metres / expected)) for unit, metres in METRES.items()}
+        fitting = min(METRES, key=lambda unit: off[unit])
+        close = off[fitting] < np.log(_SAME_SIZE)
+        if not close and abs(np.log(sizes[0] / expected)) < np.log(_OTHER_AGE):
             return
         mend = f"If the file is in {fitting}, pass unit={fitting}"
-        other = f"No unit of {', '.join(METRES)} fits: look at backend= and its parameters, or at the export's scale"
+        other = "m, cm and mm do not fit: look at backend= and its parameters, or at the scale of the export"
         raise InputError(
             str(self.sequence.path),
             got=f"a body {sizes[0] / expected:.3g} times as large as its identity, for lengths in {name}",

@@ -254,8 +254,8 @@ def of_params(spec: BackendSpec, params: Mapping[str, Any], *, setting: str = "b
             worst = values[int(beyond.argmax())]
             meaning = f" ({parameter.description})" if parameter.description else ""
             told.append(
-                f"{setting}{parameter.name}={worst:g} is far outside the range of {spec.name}, {low:g} to {high:g}"
-                f"{meaning}; `soma backends show {spec.name}` lists all ranges"
+                f"{setting}{parameter.name}={worst:g} is far outside the range of {spec.name}, {low:g} to "
+                f"{high:g}{meaning}; `soma backends show {spec.name}` lists all ranges"
             )
     return told
 

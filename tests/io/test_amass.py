@@ -120,7 +120,7 @@ def test_what_is_no_file_is_refused(tmp_path):
     [
         ({"model": "mano"}, "model: got 'mano', expected one of 'smpl', 'smplh', 'smplx'"),
         ({"gender": "any"}, "gender: got 'any'"),
-        ({"up": "-y"}, "up: got '-y'"),
+        ({"up": "+x"}, r"up: got '\+x'"),
         ({"fps": 0}, "fps: got 0, expected a positive number"),
         ({"rotations": np.zeros((FRAMES, 24, 3))}, r"rotations: got shape \(4, 24, 3\), .* \(4, 52, 3\)"),
         ({"rotations": np.zeros((0, 52, 3))}, r"rotations: got shape \(0, 52, 3\)"),

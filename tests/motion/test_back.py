@@ -146,7 +146,7 @@ def test_a_motion_without_a_body_needs_one(tmp_path):
     ("keys", "said"),
     [
         ({"poses": 0, "trans": 0}, "got the layout amass, expected a motion on this skeleton"),
-        ({"betas": 0}, "got no motion under any key"),
+        ({"betas": 0}, "got the keys betas, expected poses"),
     ],
 )
 def test_what_is_no_motion_on_this_skeleton_is_refused(tmp_path, keys, said):
