@@ -39,7 +39,7 @@ def read_motion(
     Args:
         path: the file. Nothing in it is executed; keys that are not needed are ignored.
         fps: frame rate; needed where the file has none (SOMA tools). kimodo files count as 30.
-        unit: ``m``, ``cm`` or ``mm``, or ``meters``, ``centimeters``, ``millimeters``; overrides the file's own.
+        unit: ``m``, ``cm``, ``mm``, or ``meters`` and so on; overrides the file's own.
         convention: what zero means; overrides the file's own.
         angles: unit of rotation vectors; None for radians.
 

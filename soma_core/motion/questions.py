@@ -54,8 +54,8 @@ _LOW, _NEAR = (0.0002, 0.02), 0.05
 body then is from the origin at most. A body that lies has its hips at 0.08 m; one that is kept at the origin,
 or measured from its first frame, has exact zeros or goes below."""
 
-_HIPS = (0.1, 3.0)
-"""Heights of hips [m]: from a newborn that lies to a jump."""
+_HIPS = (0.05, 1.5)
+"""Lowest heights of hips in a clip [m]: from a newborn that lies to a giant who stands."""
 
 _SPAN, _LEAP, _USUAL = 0.5, 10.0, 12.5
 """Half a second [s], how far nobody gets in it or in less [m], and the speed of the best sprinters [m/s]."""
@@ -203,8 +203,10 @@ def _pace(places: np.ndarray, fps: float) -> float:
 
 def _units_of_height(height: float, pace: float) -> list[Unit]:
     """Units in which a height is one of hips; none where a body would move less than a living one."""
-    units = [unit for unit in _SMALLER if _HIPS[0] < height * METRES[unit] < _HIPS[1]] or ["cm"]
-    return [unit for unit in units if pace == 0 or pace * METRES[unit] > _STILL]
+    units = [unit for unit in _SMALLER if _HIPS[0] < height * METRES[unit] < _HIPS[1]]
+    if pace == 0:
+        return units or ["cm"]
+    return [unit for unit in units if pace * METRES[unit] > _STILL]
 
 
 def _fastest(places: np.ndarray, fps: float) -> tuple[float, int | None]:
@@ -212,13 +214,14 @@ def _fastest(places: np.ndarray, fps: float) -> tuple[float, int | None]:
     span = min(max(round(_SPAN * fps), 1), len(places) - 1)
     if span < 1:
         return 0.0, None
-    far = float(np.linalg.norm(places[span:] - places[:-span], axis=1).max())
+    lags = sorted({1, max(span // 4, 1), max(span // 2, 1), span})  # a body may swing back within the longest
+    ways = {lag: np.linalg.norm(places[lag:] - places[:-lag], axis=1) for lag in lags}
+    lag = max(lags, key=lambda each: float(ways[each].max()))
+    far, leap = float(ways[lag].max()), int(ways[1].argmax()) + 1
     if far <= _LEAP:
         return 0.0, None
-    steps = np.linalg.norm(np.diff(places, axis=0), axis=1)
-    leap = int(steps.argmax()) + 1
-    at_once = len(places) >= _FEW and steps[leap - 1] > _AT_ONCE * far
-    return far * fps / span, leap if at_once else None
+    at_once = len(places) >= _FEW and ways[1][leap - 1] > _AT_ONCE * far
+    return far * fps / lag, leap if at_once else None
 
 
 def _of_legs(motion: Motion, names: Names) -> list[str]:

@@ -15,7 +15,7 @@ METRES: dict[Unit, float] = {"m": 1.0, "cm": 0.01, "mm": 0.001}
 METRES_PER_UNIT = {"meters": METRES["m"], "centimeters": METRES["cm"], "millimeters": METRES["mm"]}
 """The same by the names that files of the SOMA tools have for them."""
 
-ANY_UNIT: dict[str, float] = {**METRES_PER_UNIT, **METRES}
+ANY_UNIT: dict[str, float] = METRES_PER_UNIT | {str(unit): metres for unit, metres in METRES.items()}
 """The same by either name."""
 
 

@@ -170,8 +170,8 @@ def test_a_world_with_another_axis_up_is_noticed(smplh_models, amass_file, tmp_p
     assert not caplog.text
     converted(amass_file, tmp_path / "y", up="y")
     said = (
-        "walk_poses.npz: the body is lying on the whole, its head along z of the file; if that is not its pose, "
-        "pass up=z"
+        "walk_poses.npz: the body is lying on the whole, its head along z of the file; if that is not its "
+        "pose, pass up=z"
     )
     assert said in caplog.text
     report = json.loads((tmp_path / "y/report.json").read_text())
