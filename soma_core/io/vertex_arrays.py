@@ -154,7 +154,9 @@ def _vertex_member(path: Path, archive: zipfile.ZipFile) -> tuple[str, ArrayHead
             f"{path}: {_KEY}",
             got=f"{shapes or 'no arrays'}: {len(fitting)} of them (frames, vertices, 3)",
             expected=f"a key '{_KEY}', or one array of that layout",
-            fix=f"Store the vertices under the key '{_KEY}'.",
+            fix="Motions are what soma convert input=FILE takes."
+            if "poses" in found or "local_rot_mats" in found
+            else f"Store the vertices under the key '{_KEY}'.",
         )
     return fitting[0], found[fitting[0]]
 

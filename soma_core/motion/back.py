@@ -30,6 +30,7 @@ from soma_core.motion.native_results import NativeTarget, SmplTarget, VertexTarg
 from soma_core.motion.options import ConvertOptions
 from soma_core.motion.questions import heard, of_motion, of_params, say
 from soma_core.native import NativeFit, NativeTransfer
+from soma_core.plugin.registry import default_registry
 from soma_core.progress import progress
 from soma_core.skeleton.identity import Identity
 
@@ -154,6 +155,12 @@ class BackConverter:
         gender = str(chosen.gender or kept)
         own = own if gender == kept else {}  # its coefficients are another body in another gender's model
         params = {"betas": list(chosen.betas)} if chosen.betas is not None else own.get("params")
+        (width,) = default_registry().spec(name).params[0].shape
+        if chosen.betas is not None and len(chosen.betas) > width:
+            raise InputError(
+                "betas", got=f"{len(chosen.betas)} coefficients",
+                expected=f"at most {width}, as your {name} model has", fix="Leave the last ones out.",
+            )  # fmt: skip
         if gender not in self._targets:
             self._targets[gender] = NativeFit(name, options={"gender": gender}, **kind)
         fit = self._targets[gender]

@@ -195,7 +195,8 @@ def _sam3d_body(path: Path, options: ConvertOptions, backends: FitBackends) -> S
         posed = PosedInput(TransferredSequence(sequence, _MHR), backend.layer, topology="canonical")
     return ShownBody(
         backend=backend, posed=posed, params=params, search=_search(options), facts={"up": "+y"},
-        licence=f"that of {path.name}", doubts=tuple(of_rate(sequence.fps or 1.0)),
+        licence=f"that of {path.name}",
+        doubts=tuple(of_rate(options.fps) + ([] if known else of_params(backend.layer.spec, params))),
     )  # fmt: skip
 
 

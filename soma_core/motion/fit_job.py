@@ -130,13 +130,13 @@ def plan_body(
     """
     layer, posed = body.backend.layer, body.posed
     settings = fit_settings(source, layout, body, options)
+    say(source.name, body.doubts)
     with torch.no_grad():
         identity = layer.identity(body.params)
         posed.check_size(layer, identity)
         found = _refuse_unfit(body.backend.inversion, posed, identity)
-    # Readers that know a file's axes say themselves where a body lies.
-    leaning = [found.sentence] if found is not None and layout == "vertices" else []
-    say(source.name, [*body.doubts, *leaning])
+    if found is not None and layout == "vertices":  # other readers say themselves where a body lies
+        say(source.name, [found.sentence])
     made_from = {**settings, "shown": options.picture.frames}
     kept = FittedChunks(chunks, made_from, frame_count=posed.sequence.frame_count, size=options.chunk)
     stored = {"backend": layer.backend, "params": body.params}

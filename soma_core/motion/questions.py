@@ -72,6 +72,9 @@ _SMALLER: tuple[Unit, ...] = ("cm", "mm")
 _LEGS = (0.1, 1.5)
 """Thigh and shin together [m]: 0.15 of a newborn, 1.2 of the tallest."""
 
+_ONE_BODY = 0.5
+"""How far the coefficients of one body may differ from frame to frame, in standard deviations."""
+
 _FAR = 0.5
 """How far beyond its range a parameter is questioned, in widths of it: from 6 for coefficients in -3 to 3."""
 
@@ -129,7 +132,7 @@ def of_motion(motion: Motion, names: Names | None = None) -> list[str]:
         hips = hips @ load_canonical("mid")[1].t_pose_world[1, :3, :3].T
     lies = _of_axes(hips[:, :, 1], "+y", names.ups)
     path = of_path(motion.translation, motion.fps, up="+y", what="the path of the Hips", names=names)
-    return of_rate(motion.fps, names) + _of_legs(motion, names) + (lies or path)
+    return of_rate(motion.fps, names) + _of_persons(motion) + _of_legs(motion, names) + (lies or path)
 
 
 def of_rate(fps: float, names: Names | None = None) -> list[str]:
@@ -222,6 +225,16 @@ def _fastest(places: np.ndarray, fps: float) -> tuple[float, int | None]:
         return 0.0, None
     at_once = len(places) >= _FEW and ways[1][leap - 1] > _AT_ONCE * far
     return far * fps / lag, leap if at_once else None
+
+
+def _of_persons(motion: Motion) -> list[str]:
+    """Whether a file of the SOMA tools holds the bodies of several persons, a row of coefficients a frame."""
+    rows = np.atleast_2d(np.asarray(motion.identity.get("identity_coeffs", 0.0), np.float64))
+    if np.ptp(rows, axis=0).max() <= _ONE_BODY:
+        return []
+    return [
+        "identity_coeffs differ from frame to frame; if it holds several persons, cut the file between them"
+    ]
 
 
 def _of_legs(motion: Motion, names: Names) -> list[str]:

@@ -38,10 +38,14 @@ def run(config: DictConfig, output: Path) -> None:
         SomaError: the mesh cannot be read, is broken, or shows no human body.
     """
     mesh, _ = load_canonical("mid")
+    folder = expanded(config.out) if config.out else output
+    if folder.exists() and not folder.is_dir():
+        raise InputError(
+            "out", got=f"{folder}, a file", expected="a folder, or a new name", fix="Pass out=DIR."
+        )
     native = _read_native(config)
     found = register(native.vertices, native.triangles, options=_options(config, native))
     quality = measure(found, mesh)
-    folder = expanded(config.out) if config.out else output
     pair = write_pair(folder, found, mesh, vertices=native.vertices, triangles=native.triangles,
                       name=native.name, source=native.file)  # fmt: skip
     write_report(folder, found, quality, native=pair.native.name)
