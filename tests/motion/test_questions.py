@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import logging
+import os
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -283,3 +285,54 @@ def test_only_what_is_said_meanwhile_in_this_package_is_heard():
         logging.getLogger("another").warning("nor this")
     log.warning("after")
     assert said == ["3 of them"]
+
+
+CASES = Path(os.environ.get("SOMA_TEST_DATA", "")) / "cases"
+
+
+@pytest.mark.parametrize(
+    ("name", "settings", "told"),
+    [
+        ("14_kimodo_hips_cm", {}, ["100 m or more above the ground; if the lengths are in cm, pass unit=cm"]),
+        ("14_kimodo_hips_cm", {"unit": "cm"}, []),
+    ],
+)
+def test_files_of_others(tmp_path, name, settings, told):
+    file = CASES / f"{name}.npz"
+    if not file.is_file():
+        pytest.skip(f"needs SOMA_TEST_DATA with {file}")
+    warnings = convert_file(file, tmp_path, options=ConvertOptions(**settings)).report["warnings"]
+    assert len(warnings) == len(told)
+    assert all(part in warning for part, warning in zip(told, warnings, strict=True))
+
+
+@pytest.mark.parametrize("name", ["01_single_text_prompt", "03_full_body_keyframes", "06_root_waypoints"])
+def test_motions_of_others_are_not_questioned(name):
+    file = CASES.with_name("motions") / f"kimodo_{name}.npz"
+    if not file.is_file():
+        pytest.skip(f"needs SOMA_TEST_DATA with {file}")
+    assert questions.of_motion(read(file)) == []
+
+
+def test_the_shipped_clip_is_not_questioned(caplog):
+    load_clip()
+    assert not caplog.text
+
+
+def test_an_earlier_run_repeats_its_doubts(smplh_models, amass, tmp_path, caplog):
+    np.savez(tmp_path / "m.npz", **amass | {"trans": 100 * amass["trans"]})
+    options = ConvertOptions(lod="low")
+    first = convert_file(tmp_path / "m.npz", tmp_path / "out", options=options)
+    (told,) = first.report["warnings"]
+    assert "trans puts the body 90 m or more above the ground" in told
+    caplog.clear()
+    again = convert_file(tmp_path / "m.npz", tmp_path / "out", options=options)
+    assert again.earlier
+    assert told in caplog.text
+
+
+def test_rows_of_coefficients_that_differ_are_several_persons():
+    rows = np.zeros((FRAMES, 8))
+    several = {"backend": "mhr", "identity_coeffs": rows + (np.arange(FRAMES) > 100)[:, None]}
+    assert "holds several persons" in questions.of_motion(moved(WALK, identity=several))[0]
+    assert not questions.of_motion(moved(WALK, identity={"backend": "mhr", "identity_coeffs": rows}))
