@@ -9,7 +9,7 @@ from typing import Any, Self, TypeVar, cast
 import torch
 from torch import Tensor
 
-from soma_core._inputs import check_choice
+from soma_core._inputs import check_choice, usable_device
 
 __all__ = ["Derived", "own_precision"]
 
@@ -29,7 +29,7 @@ class Derived(torch.nn.Module):
         device, dtype: of all constants and results.
 
     Raises:
-        InputError: neither float32 nor float64.
+        InputError: neither float32 nor float64, or no such device here.
     """
 
     def __init__(self, given: Mapping[str, Any], device: torch.device | str, dtype: torch.dtype) -> None:
@@ -40,7 +40,7 @@ class Derived(torch.nn.Module):
             for name, value in given.items()
             if name not in ("self", "__class__")
         }
-        self.device, self.dtype = torch.device(device), dtype
+        self.device, self.dtype = usable_device(device), dtype
 
     def _build(self, device: torch.device, dtype: torch.dtype) -> None:
         """Derive all constants, in place of those that are there."""

@@ -18,6 +18,7 @@ __all__ = [
     "check_translation",
     "common_batch",
     "may_look",
+    "usable_device",
     "widened",
 ]
 
@@ -34,6 +35,25 @@ def check_choice(argument: str, value: object, choices: tuple[object, ...]) -> N
             expected="one of " + ", ".join(map(repr, choices)),
             fix=f"Pass {argument}={choices[0]!r}.",
         )
+
+
+def usable_device(device: torch.device | str) -> torch.device:
+    """The device by its name, if tensors can be made there; otherwise a refusal that says why not."""
+    try:
+        found = torch.device(device)
+        torch.empty(0, device=found)
+    except (RuntimeError, AssertionError, NotImplementedError) as error:  # torch raises all three
+        unknown = "Expected one of" in str(error)
+        why = "no name of a device" if unknown else str(error).splitlines()[0].rstrip(".")
+        if str(device).startswith("cuda") and torch.version.cuda is None:
+            why = "this PyTorch was built without CUDA"
+        count = torch.cuda.device_count()
+        known = ", ".join(["cpu", *(f"cuda:{index}" for index in range(count))])
+        raise InputError(
+            "device", got=f"{str(device)!r} ({why})", expected=f"a device of this machine: {known}",
+            fix="Pass device=cpu.",
+        ) from error  # fmt: skip
+    return found
 
 
 def widened(value: Tensor, dtype: torch.dtype) -> Tensor:

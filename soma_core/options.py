@@ -16,7 +16,9 @@ from soma_core.errors import InputError
 
 __all__ = [
     "AnalyticalChoice",
+    "AngleUnit",
     "AutogradChoice",
+    "Axes",
     "BackendChoice",
     "BetasFrom",
     "BodyGender",
@@ -46,6 +48,7 @@ __all__ = [
     "PriorChoice",
     "Product",
     "RotationLayout",
+    "RotationZero",
     "SmplLayout",
     "SmplModel",
     "Topology",
@@ -165,7 +168,7 @@ class Kernels(StrEnum):
 
 
 class LengthUnit(StrEnum):
-    """Unit of a file's vertices."""
+    """Unit of a file's lengths."""
 
     m = "m"
     cm = "cm"
@@ -233,11 +236,28 @@ class Translation(StrEnum):
     none = "none"
 
 
-class Upward(StrEnum):
-    """Upward axis of a file's vertices."""
+Upward = StrEnum("Upward", {"y": "y", "z": "z", "-y": "-y", "-z": "-z", "+y": "y", "+z": "z"})
+"""Upward axis of a file's world; ``+y`` is another name of ``y``."""
 
-    y = "y"
-    z = "z"
+
+class Axes(StrEnum):
+    """Axes of a file's world by name: a camera's have y down, and z forward, away from it."""
+
+    camera = "camera"
+
+
+class RotationZero(StrEnum):
+    """What the rotations of a file on this skeleton are relative to."""
+
+    t_pose_relative = "t_pose_relative"
+    absolute_local = "absolute_local"
+
+
+class AngleUnit(StrEnum):
+    """Unit of a file's rotation vectors."""
+
+    rad = "rad"
+    deg = "deg"
 
 
 class Options:

@@ -7,9 +7,20 @@ from pathlib import Path
 
 from soma_core.errors import InputError
 
-__all__ = ["assets_dir", "cache_dir", "configs_dir", "data_dir"]
+__all__ = ["assets_dir", "cache_dir", "configs_dir", "data_dir", "expanded"]
 
 _PACKAGE = Path(__file__).resolve().parent
+
+
+def expanded(path: str | os.PathLike[str]) -> Path:
+    """A path with ``~`` as the home folder, unless a file is called so or there is no such home."""
+    path = Path(path)
+    if not path.parts or not path.parts[0].startswith("~") or os.path.lexists(path):
+        return path
+    try:
+        return path.expanduser()
+    except RuntimeError:  # ~name of nobody on this machine: a file that is yet to be written
+        return path
 
 
 def _shipped(name: str) -> Path:

@@ -14,7 +14,7 @@ import numpy as np
 
 from soma_core.errors import AssetError
 from soma_core.npz import open_npz_file
-from soma_core.paths import assets_dir
+from soma_core.paths import assets_dir, expanded
 from soma_core.plugin.hookspecs import hookimpl
 from soma_core.plugin.spec import BackendSpec, Generator, LinearBasis, Parameter
 from soma_core.rig.manifest import RESTORE
@@ -86,7 +86,7 @@ def soma_generator(
     from soma_core.rig.neutral import load_shape_space
 
     path = options.get("shape_space")
-    space = load_shape_space(Path(path).expanduser() if path else None)
+    space = load_shape_space(expanded(path) if path else None)
     scaled = np.sqrt(space.eigenvalues.astype(np.float64))[:, None] * space.shapedirs
     (count,) = spec.params[0].shape
     directions = scaled[:count].reshape(-1, *space.mean.shape)

@@ -2,22 +2,24 @@
 
 from __future__ import annotations
 
+import importlib
 import os
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 import hydra
 from hydra.core.hydra_config import HydraConfig
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 
-from soma_core.config.refusals import REFUSALS, check_backend_choice, in_our_words
+from soma_core.config.overrides import literal_texts
+from soma_core.config.refusals import REFUSALS, check_backend_choice, in_our_words, with_settings
 from soma_core.config.run_folder import run_log, write_provenance
-from soma_core.config.schema import register_schemas
+from soma_core.config.schema import SCHEMAS, register_schemas
 from soma_core.config.searchpath import register_search_path
-from soma_core.errors import SomaError
+from soma_core.errors import InputError, SomaError
 
 __all__ = ["Task", "run_task"]
 
@@ -48,26 +50,53 @@ def run_task(
     """
     register_schemas()
     register_search_path()
+    running: list[Path] = []
 
     def job(config: DictConfig) -> None:
-        folder = Path(HydraConfig.get().runtime.output_dir)
+        # As hydra made it: a name that holds ${...} would be taken for an interpolation when it is read.
+        runtime: Any = OmegaConf.to_container(HydraConfig.get().runtime, resolve=False)
+        folder = Path(runtime["output_dir"])
+        running.append(folder)
         try:
             with run_log(folder):
                 check_backend_choice(config)
+                _check_device(config)
                 write_provenance(folder, config, command=[*program.split(), *overrides])
                 task()(config, folder)
         except SomaError as error:
             if os.environ.get("SOMA_STRICT") == "1":
                 raise
-            report(error)
+            report(with_settings(error))
         else:
             report(folder)
+        running.clear()
 
-    with _hydra_process(program, overrides):
+    with _hydra_process(program, literal_texts(overrides, SCHEMAS[config_name])):
         try:
             hydra.main(config_path=None, config_name=config_name, version_base="1.3")(job)()
         except REFUSALS as error:
             raise in_our_words(error) from error
+        except OSError as error:
+            if running or error.filename is None:
+                raise
+            raise _no_folder(error, config_name) from error
+
+
+def _check_device(config: DictConfig) -> None:
+    """Refuse a device that this machine has not, before anything is written; `--help` imports no torch."""
+    if config.get("device") is not None:
+        importlib.import_module("soma_core._inputs").usable_device(config.device)
+
+
+def _no_folder(error: OSError, config_name: str) -> InputError:
+    """Say that the folder of a run cannot be made, and which setting names another."""
+    setting = "out" if config_name == "convert" else "hydra.run.dir"
+    files = isinstance(error, FileExistsError | NotADirectoryError)
+    why = "a file of that name is in the way" if files else error.strerror
+    return InputError(
+        setting, got=f"{error.filename}, which cannot be made ({why})", expected="a folder, or a new name",
+        fix=f"Pass {setting}=DIR.",
+    )  # fmt: skip
 
 
 @contextmanager

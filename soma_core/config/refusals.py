@@ -8,7 +8,12 @@ from pathlib import Path
 from hydra.core.hydra_config import HydraConfig
 from hydra.errors import HydraException, MissingConfigException, OverrideParseException
 from omegaconf import DictConfig, OmegaConf
-from omegaconf.errors import ConfigAttributeError, ConfigKeyError, OmegaConfBaseException
+from omegaconf.errors import (
+    ConfigAttributeError,
+    ConfigKeyError,
+    InterpolationResolutionError,
+    OmegaConfBaseException,
+)
 from yaml import YAMLError
 
 from soma_core.errors import InputError, SomaError
@@ -16,14 +21,15 @@ from soma_core.plugin.declaration import did_you_mean
 from soma_core.plugin.errors import BrokenBackendError
 from soma_core.plugin.registry import default_registry
 
-__all__ = ["REFUSALS", "check_backend_choice", "in_our_words"]
+__all__ = ["REFUSALS", "check_backend_choice", "in_our_words", "with_settings"]
 
-REFUSALS = (HydraException, YAMLError, UnicodeError)
+REFUSALS = (HydraException, InterpolationResolutionError, YAMLError, UnicodeError)
 """What composing a configuration may raise."""
 
 _SHOWN_KEYS = 16
 """A backend may have hundreds of parameters; an error message lists this many."""
 
+_PARAMETER = re.compile(r"params\['(?P<name>.+)'\]")
 _COMPOSING = re.compile(r"In '(?P<file>[^']+)': \w+ raised while composing config:\s*(?P<cause>[^\n]*)")
 
 
@@ -32,11 +38,14 @@ def in_our_words(error: Exception) -> SomaError:
     if isinstance(error, MissingConfigException):
         return _missing_choice(error)
     if isinstance(error, OverrideParseException):
+        return _unparsed(error)
+    if isinstance(error, InterpolationResolutionError):
+        name = str(error.full_key or "configuration")
         return InputError(
-            error.override,
+            name,
             got=_first_line(error),
-            expected="key=value",
-            fix="Quote values with spaces, commas or brackets: 'key=\"a, b\"'",
+            expected="${SETTING} or a resolver of hydra",
+            fix="Correct the name.",
         )
     if not isinstance(error, HydraException):
         return _unreadable_file(error)
@@ -47,6 +56,31 @@ def in_our_words(error: Exception) -> SomaError:
         return _refused_value(error.__cause__)
     first, *rest = str(error).splitlines()
     return InputError("configuration", got=first, expected="key=value", fix=" ".join(rest) or "See --help")
+
+
+def with_settings(error: SomaError) -> SomaError:
+    """Name a parameter of the body by its setting, where an error has it as an argument of Python."""
+    found = _PARAMETER.fullmatch(error.argument) if isinstance(error, InputError) else None
+    if found is None or not isinstance(error, InputError):
+        return error
+    setting = f"backend.params.{found['name']}"
+    fix = (
+        error.fix if "soma backends show" in error.fix else f"Correct {setting}; see: soma backends show NAME"
+    )
+    return InputError(setting, got=error.got, expected=error.expected, fix=fix)
+
+
+def _unparsed(error: OverrideParseException) -> InputError:
+    """Refuse what is no setting; a path alone is the usual mistake."""
+    override = error.override
+    if "=" not in override:
+        return InputError(
+            override, got="no setting", expected="key=value", fix="A file or folder is given as input=PATH."
+        )
+    return InputError(
+        override, got=_first_line(error), expected="key=value",
+        fix="Quote values with blanks, commas or brackets: 'key=\"a, b\"'",
+    )  # fmt: skip
 
 
 def check_backend_choice(config: DictConfig) -> None:

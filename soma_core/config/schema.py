@@ -28,6 +28,7 @@ from soma_core.options import (
 )
 
 __all__ = [
+    "SCHEMAS",
     "AnimateConfig",
     "BenchConfig",
     "ConvertConfig",
@@ -56,6 +57,7 @@ class _PlayedMotion(Options):
     motion: str | None = None
     motion_fps: float | None = None
     person: str | None = None
+    motion_unit: LengthUnit | None = None
     identity_from: IdentitySource = IdentitySource.backend
     frames: FrameRange = field(default_factory=FrameRange)
     translation: Translation = Translation.ground
@@ -196,6 +198,19 @@ class WrapConfig:
     picture: bool = True
 
 
+SCHEMAS: dict[str, type] = {
+    "animate": AnimateConfig,
+    "invert": InvertConfig,
+    "convert": ConvertConfig,
+    "train_shape": TrainShapeConfig,
+    "train_correctives": TrainCorrectivesConfig,
+    "evaluate": EvaluateConfig,
+    "bench": BenchConfig,
+    "wrap": WrapConfig,
+}
+"""Task -> schema of its configuration."""
+
+
 def _listed_products(program: str) -> str:
     """What a help text says of ``write=``, for the commands that have it."""
     if program not in ("soma animate", "soma convert"):
@@ -207,14 +222,5 @@ def register_schemas() -> None:
     """Make the schemas known to hydra under ``<task>_schema``; safe to call again."""
     OmegaConf.register_new_resolver("soma_products", _listed_products, replace=True)
     store = ConfigStore.instance()
-    for task, schema in (
-        ("animate", AnimateConfig),
-        ("invert", InvertConfig),
-        ("convert", ConvertConfig),
-        ("train_shape", TrainShapeConfig),
-        ("train_correctives", TrainCorrectivesConfig),
-        ("evaluate", EvaluateConfig),
-        ("bench", BenchConfig),
-        ("wrap", WrapConfig),
-    ):
+    for task, schema in SCHEMAS.items():
         store.store(name=f"{task}_schema", node=schema)

@@ -23,6 +23,7 @@ from soma_core.inversion.report import InversionReport
 from soma_core.inversion.result import InversionResult
 from soma_core.io.sam3d import read_sam3d
 from soma_core.layer import SomaLayer
+from soma_core.paths import expanded
 from soma_core.plugin.spec import BackendSpec
 from soma_core.progress import progress
 from soma_core.registration.native_mesh import read_native_mesh
@@ -156,7 +157,7 @@ def _find(folder: str | None) -> tuple[Path, list[Path]]:
             expected=f"a folder with {NEUTRAL} and mhr/{_FRAMES}, of the MHR repository",
             fix=f"Pass experiment.data=FOLDER, or set {_VARIABLE}.",
         )
-    neutral = Path(named).expanduser() / NEUTRAL
+    neutral = expanded(named) / NEUTRAL
     refuse_unreadable(neutral, fix="Name a folder that holds it by experiment.data.")
     files = sorted(neutral.parent.glob(_FRAMES))
     if not files:

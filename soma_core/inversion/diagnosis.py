@@ -15,7 +15,7 @@ from soma_core.inversion.cloud_strain import MEAN_OF_NOISE, CloudStrain, SkinClo
 from soma_core.layer import SomaLayer
 from soma_core.skeleton.identity import Identity
 
-__all__ = ["Cause", "Diagnosis", "diagnose_fit"]
+__all__ = ["Cause", "Diagnosis", "Leaning", "diagnose_fit", "leaning"]
 
 Cause = Literal["missing", "order", "mirrored", "change", "person", "unexplained", "axis"]
 
@@ -270,21 +270,46 @@ def _unfitting(strain: CloudStrain, errors: np.ndarray, searched: bool) -> Diagn
     return None
 
 
-def _leaning(strain: CloudStrain, axes: np.ndarray, ups: Collection[str]) -> Diagnosis | None:
-    """A body that lies, or stands on its head, on the whole."""
-    mean = strain.upward.mean(axis=0)
+@dataclass(frozen=True, kw_only=True)
+class Leaning:
+    """How a body lies.
+
+    Attributes:
+        sentence: what was found.
+        along: axis of the file that its head points along, as the setting ``up`` has it.
+    """
+
+    sentence: str
+    along: str
+
+
+def leaning(upward: np.ndarray, axes: np.ndarray) -> Leaning | None:
+    """Tell whether a body lies, or stands on its head, in most frames; None for one that stands or sits.
+
+    Args:
+        upward: (frames, 3) direction from its hips to its head, +Y up.
+        axes: rotation (3, 3) from the axes of the file to +Y up.
+    """
+    mean = upward.mean(axis=0)
     along = int(np.abs(mean).argmax())
     if abs(mean[along]) < _ALONG or (along == 1 and mean[1] > 0):
         return None
     own = axes.T @ mean
     axis = int(np.abs(own).argmax())
     name = ("" if own[axis] > 0 else "-") + "xyz"[axis]
-    upside = along == 1
-    posture = "upside down" if upside else "lying"
+    posture = "upside down" if along == 1 else "lying"
+    return Leaning(
+        sentence=f"the body is {posture} on the whole, its head along {name} of the file", along=name
+    )
+
+
+def _leaning(strain: CloudStrain, axes: np.ndarray, ups: Collection[str]) -> Diagnosis | None:
+    """The same as a cause, with the setting that mends it."""
+    found = leaning(strain.upward, axes)
+    if found is None:
+        return None
+    name = found.along
     mend = f"pass up={name}" if name in ups else f"turn the vertices until {name} points up"
     return Diagnosis(
-        cause="axis",
-        failed=False,
-        sentence=f"the body is {posture} on the whole, its head along {name} of the file; if that is not its "
-        f"pose, {mend}",
+        cause="axis", failed=False, sentence=f"{found.sentence}; if that is not its pose, {mend}"
     )

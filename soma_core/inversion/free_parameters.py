@@ -91,7 +91,7 @@ class FreeParameters:
                 "free",
                 got="no parameter",
                 expected="at least one that may change",
-                fix="Name some, or fit without the backend: method='unpose'.",
+                fix="Name some in free, or fit without the backend by the method unpose.",
             )
         return [declared[name] for name in dict.fromkeys(names)]
 

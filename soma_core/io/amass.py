@@ -11,6 +11,7 @@ import numpy as np
 
 from soma_core.cache import atomic_arrays
 from soma_core.errors import InputError
+from soma_core.io.vertex_sequence import UpAxis
 
 __all__ = [
     "SMPL_JOINTS",
@@ -72,7 +73,7 @@ class SmplMotion:
     betas: np.ndarray
     gender: Gender
     fps: float
-    up: Literal["+y", "+z", "-y", "-z"] = "+z"
+    up: UpAxis = "+z"
     about: Literal["pelvis", "origin"] = "pelvis"
     flat_hands: bool = True
     source: str = ""
@@ -84,7 +85,7 @@ class SmplMotion:
         for name, value, among in (
             ("model", self.model, get_args(SmplName)),
             ("gender", self.gender, get_args(Gender)),
-            ("up", self.up, ("+y", "+z", "-y", "-z")),
+            ("up", self.up, get_args(UpAxis)),
             ("about", self.about, ("pelvis", "origin")),
         ):
             if value not in among:

@@ -17,7 +17,8 @@ from soma_core.io.joint_order import (
 )
 from soma_core.io.motion import Motion
 from soma_core.io.npz_fields import NpzFields, check_rotations
-from soma_core.io.soma_npz import LIKELY_CONTACT, METRES_PER_UNIT
+from soma_core.io.soma_npz import LIKELY_CONTACT
+from soma_core.topology.frames import ANY_UNIT
 
 __all__ = ["KIMODO_FPS", "read_kimodo_npz"]
 
@@ -79,7 +80,7 @@ def read_kimodo_npz(
     check_rotations(f"{fields.path}: {key}", stored)
     names = _ORDERS[count]
     local = stored if key == "local_rot_mats" else _local_rotations(stored, names)
-    metres = METRES_PER_UNIT[unit] if unit else 1.0
+    metres = ANY_UNIT[unit or "m"]
     return Motion(
         rotations=_all_joints(local, names),
         translation=metres * _hips(sample, frames, count),

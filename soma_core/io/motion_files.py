@@ -34,15 +34,17 @@ def read_motion(
     unit: str | None = None,
     convention: Convention | None = None,
     person: str | None = None,
+    angles: Literal["rad", "deg"] | None = None,
 ) -> Motion:
     """Read a motion from an NPZ file: our schema, the SOMA tools' files, kimodo's or GEM-X's.
 
     Args:
         path: the file. Nothing in it is executed; keys that are not needed are ignored.
         fps: frame rate; needed where the file has none (SOMA tools, GEM-X). kimodo files count as 30.
-        unit: ``meters``, ``centimeters`` or ``millimeters``; overrides the file's own.
+        unit: ``m``, ``cm``, ``mm``, or ``meters`` and so on; overrides the file's own.
         convention: what zero means; overrides the file's own.
         person: which of the samples of kimodo or the people of GEM-X, from ``0``.
+        angles: unit of rotation vectors; None for radians.
 
     Returns:
         The motion in metres, +Y up, 77 joints with Hips first.
@@ -55,7 +57,7 @@ def read_motion(
         if "global_rot_mats" in fields or "local_rot_mats" in fields:
             return read_kimodo_npz(fields, fps=fps, unit=unit, person=person)
         if "schema_version" in fields or ("poses" in fields and "transl" in fields):
-            return read_soma_npz(fields, fps=fps, unit=unit, convention=convention)
+            return read_soma_npz(fields, fps=fps, unit=unit, convention=convention, angles=angles)
         parts = gem_x_parts(fields)
         if parts is not None:
             return gem_x_motion(parts, path=fields.path, fps=fps, person=person)
@@ -63,7 +65,7 @@ def read_motion(
             "layout",
             got=f"the keys {', '.join(fields.names) or '(none)'}",
             expected="'poses' and 'transl' (SOMA), 'global_rot_mats' (kimodo), or 'body_pose' (GEM-X)",
-            fix="Convert the motion to the SOMA skeleton first.",
+            fix=f"soma convert input={fields.path} brings motions of other tools to this skeleton.",
         )
 
 

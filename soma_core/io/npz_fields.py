@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -11,10 +12,16 @@ import numpy as np
 from soma_core.errors import InputError
 from soma_core.npz import NpzFile, open_npz_file
 
-__all__ = ["NpzFields", "check_rotations", "open_npz"]
+__all__ = ["NpzFields", "check_rotations", "open_npz", "say_overridden"]
 
 ORTHONORMAL_TOLERANCE = 1e-3
 """Largest entry of |RᵀR - I| accepted; half-precision files reach 5e-4, a scaled matrix does not pass."""
+
+
+_SAME_RATE = 2e-3
+"""Relative difference of frame rates that are the same, as 29.97 and 30 are."""
+
+_log = logging.getLogger(__name__)
 
 
 class NpzFields:
@@ -111,6 +118,17 @@ class NpzFields:
                 key, got=f"{len(values)} texts", expected="one text", fix="Store a single string."
             )
         return values[0]
+
+
+def say_overridden(path: Path, setting: str, *, given: float | str, own: float | str) -> None:
+    """Warn where a setting of a person takes the place of what a file says itself."""
+    if isinstance(given, str) or isinstance(own, str):
+        same = given == own
+    else:
+        same = abs(given - own) <= _SAME_RATE * own
+    if not same:
+        told = [each if isinstance(each, str) else f"{each:g}" for each in (given, own)]
+        _log.warning("%s: %s=%s is taken in place of the file's own, %s", path.name, setting, *told)
 
 
 @contextmanager

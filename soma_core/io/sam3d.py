@@ -14,6 +14,9 @@ import numpy as np
 from soma_core.errors import AssetError, InputError
 from soma_core.files import refuse_unreadable
 from soma_core.io.npz_fields import NpzFields, open_npz
+from soma_core.paths import expanded
+from soma_core.plugin.spec import Unit
+from soma_core.topology.frames import METRES
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -75,7 +78,9 @@ class Sam3dFrames:
         return len(self.vertices)
 
 
-def read_sam3d(path: str | Path, *, axes: Literal["camera", "model"] = "camera") -> Sam3dFrames:
+def read_sam3d(
+    path: str | Path, *, axes: Literal["camera", "model"] = "camera", unit: Unit = "m"
+) -> Sam3dFrames:
     """Read the output of SAM 3D Body for one person: one frame, or frames stacked along the first axis.
 
     An ``.npz`` holds the keys of the output; a ``.parquet``, which needs pyarrow, a frame a row and a key a
@@ -85,12 +90,13 @@ def read_sam3d(path: str | Path, *, axes: Literal["camera", "model"] = "camera")
         path: the file.
         axes: ``camera``, as SAM 3D Body writes them (+Y down, +Z away from the camera), or ``model`` for
             vertices that were turned back already.
+        unit: of the lengths, ``m``, ``cm`` or ``mm``; SAM 3D Body writes metres.
 
     Raises:
         AssetError: missing, damaged, or no file of its suffix.
         InputError: no vertices, another mesh than MHR LOD 1, another unit, or numbers that are not finite.
     """
-    path = Path(path).expanduser()
+    path = expanded(path)
     suffix = path.suffix.lower()
     if suffix not in SAM3D_SUFFIXES:
         raise InputError(
@@ -101,6 +107,8 @@ def read_sam3d(path: str | Path, *, axes: Literal["camera", "model"] = "camera")
             "axes", got=repr(axes), expected="'camera' or 'model'", fix="SAM 3D Body writes camera axes."
         )
     found = _read_npz(path) if suffix == ".npz" else _read_parquet(path)
+    for key in {_VERTICES, _PLACEMENT} & found.keys() if unit != "m" else ():
+        found[key] = found[key] * METRES[unit]
     _check(path, found)
     turn = _CAMERA_TO_MODEL if axes == "camera" else np.float32(1)
     vertices = found.pop(_VERTICES) * turn
@@ -227,20 +235,21 @@ def _check(path: Path, found: Mapping[str, np.ndarray]) -> None:
     edges = np.ptp(found[_VERTICES], axis=1).max(axis=1)
     size, (low, high) = float(np.median(edges)), _SIZES
     if not low <= size <= high:
-        centimetres = low <= size / 100 <= high
+        unit = next((name for name, metres in METRES.items() if low <= size * metres <= high), None)
         raise InputError(
             f"{path}: {_VERTICES}",
-            got=f"a body of {size:.4g}" + (", as in centimetres" if centimetres else ""),
-            expected=f"metres, {low:g} to {high:g}",
-            fix="Divide them by 100." if centimetres else "Scale them to metres.",
+            got=f"a body of {size:.4g} m" + (f", as of a file in {unit}" if unit else ""),
+            expected=f"{low:g} to {high:g} m",
+            fix=f"Pass unit={unit or 'm, cm or mm, as they are stored'}.",
         )
 
 
 def _warn_upside_down(path: Path, vertices: np.ndarray, axes: str) -> None:
     up = vertices[:, _TOP, 1] > vertices[:, _SOLE, 1]
     if up.mean() < 0.5:
-        other = "model" if axes == "camera" else "camera"
+        upright = "y" if axes == "camera" else "-y"
         _log.warning(
-            "%s: the body is upside down in most frames; if that is not its pose, read with axes='%s'",
-            path, other,
-        )  # fmt: skip
+            "%s: the body is upside down in most frames; if that is not its pose, pass up=%s",
+            path.name,
+            upright,
+        )

@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
-from typing import cast
+import logging
+from typing import Literal, cast
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from soma_core.io.joint_order import CONTACT_JOINTS, USER_JOINTS
 from soma_core.io.motion import Convention, Motion
-from soma_core.io.npz_fields import NpzFields, check_rotations
+from soma_core.io.npz_fields import NpzFields, check_rotations, say_overridden
+from soma_core.io.rotation_vectors import degrees_doubt, in_radians
 from soma_core.json_file import parse_json
-from soma_core.topology.frames import METRES_PER_UNIT
+from soma_core.topology.frames import ANY_UNIT, METRES_PER_UNIT
 
 __all__ = ["LIKELY_CONTACT", "METRES_PER_UNIT", "SCHEMA_VERSION", "read_soma_npz"]
+
+_log = logging.getLogger(__name__)
 
 SCHEMA_VERSION = 1
 """Version of the motion schema that this package writes."""
@@ -27,7 +31,12 @@ _ROOT_TOLERANCE = 1e-4
 
 
 def read_soma_npz(
-    fields: NpzFields, *, fps: float | None, unit: str | None, convention: Convention | None
+    fields: NpzFields,
+    *,
+    fps: float | None,
+    unit: str | None,
+    convention: Convention | None,
+    angles: Literal["rad", "deg"] | None = None,
 ) -> Motion:
     """Read a motion whose rotations are stored under ``poses``.
 
@@ -39,7 +48,7 @@ def read_soma_npz(
         InputError: a key is missing, has another layout, or contradicts another key.
     """
     _check_schema(fields)
-    rotations = _rotations(fields)
+    rotations = _rotations(fields, angles)
     rotations = rotations[:, _columns(fields, rotations)]
     metres = _metres(fields, unit)
     translation = fields.numbers("transl", (len(rotations), 3)) * metres
@@ -107,7 +116,7 @@ def _check_schema(fields: NpzFields) -> None:
         )
 
 
-def _rotations(fields: NpzFields) -> np.ndarray:
+def _rotations(fields: NpzFields, angles: Literal["rad", "deg"] | None) -> np.ndarray:
     """Matrices (frames, joints, 3, 3) float64, stored as such or as rotation vectors."""
     stored = fields.raw("poses")
     default = "matrix" if stored.ndim == 4 else "rotvec"
@@ -119,8 +128,15 @@ def _rotations(fields: NpzFields) -> np.ndarray:
     if kind == "matrix":
         matrices = fields.numbers("poses", ("frames", "77 or 78", 3, 3))
         check_rotations(f"{fields.path}: poses", matrices)
+        if angles == "deg":
+            raise fields.refuse(
+                "poses", got="rotation matrices", expected="vectors, for angles=deg", fix="Leave angles out."
+            )
         return matrices
-    vectors = fields.numbers("poses", ("frames", "77 or 78", 3))
+    vectors = in_radians(fields.path, fields.numbers("poses", ("frames", "77 or 78", 3)), angles)
+    doubt = None if angles else degrees_doubt(vectors)
+    if doubt:
+        _log.warning("%s: %s", fields.path.name, doubt)
     return Rotation.from_rotvec(vectors.reshape(-1, 3)).as_matrix().reshape(*vectors.shape, 3)
 
 
@@ -157,26 +173,31 @@ def _check_root(fields: NpzFields, root: np.ndarray) -> None:
 
 
 def _metres(fields: NpzFields, unit: str | None) -> float:
-    name = unit if unit is not None else fields.text("unit", "")
-    if name not in METRES_PER_UNIT:
+    own = fields.text("unit", "")
+    if unit is not None and own and ANY_UNIT.get(own) != ANY_UNIT.get(unit):
+        say_overridden(fields.path, "unit", given=unit, own=own)
+    name = unit if unit is not None else own
+    if name not in ANY_UNIT:
         raise fields.refuse(
             "unit",
             got=repr(name) if name else "no unit",
             expected=" or ".join(map(repr, METRES_PER_UNIT)),
-            fix="Pass unit='meters' (or the true unit) to read_motion.",
+            fix="Pass unit=m, cm or mm (motion_unit= to soma animate).",
         )
-    return METRES_PER_UNIT[name]
+    return ANY_UNIT[name]
 
 
 def _frame_rate(fields: NpzFields, fps: float | None) -> float:
     if fps is not None:
+        if "fps" in fields:
+            say_overridden(fields.path, "fps", given=fps, own=fields.number("fps"))
         return float(fps)
     if "fps" not in fields:
         raise fields.refuse(
             "fps",
             got="no frame rate",
             expected="frames per second",
-            fix="Pass fps=30 (or the true rate) to read_motion.",
+            fix="Pass fps=30, the true rate (motion_fps= to soma animate).",
         )
     return fields.number("fps")
 
@@ -194,7 +215,7 @@ def _convention(fields: NpzFields, convention: Convention | None) -> Convention:
             "absolute_pose",
             got=f"absolute_pose={not relative} {'with' if has_orient else 'without'} joint_orient",
             expected="joint_orient exactly when poses are T-pose-relative",
-            fix="Pass convention='t_pose_relative' or 'absolute_local' to read_motion.",
+            fix="Say which by soma convert convention=t_pose_relative or absolute_local.",
         )
     return "t_pose_relative" if relative else "absolute_local"
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import zipfile
 import zlib
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import IO, TypeVar
 
@@ -14,13 +14,12 @@ from soma_core.errors import AssetError, InputError, SomaError
 from soma_core.io.npz_fields import NpzFields, open_npz
 from soma_core.io.vertex_sequence import UpAxis, VertexSequence
 from soma_core.npz import ArrayHeader, read_array_header
-from soma_core.topology.frames import METRES, METRES_PER_UNIT
+from soma_core.topology.frames import ANY_UNIT
 
 __all__ = ["ArraySequence", "open_npy", "open_npz_vertices"]
 
 _KEY = "vertices"
-_UNITS = METRES_PER_UNIT | {str(unit): metres for unit, metres in METRES.items()}
-_AXES: dict[str, UpAxis] = {"Y": "+y", "Z": "+z"}
+_AXES: dict[str, UpAxis] = {"Y": "+y", "Z": "+z", "-Y": "-y", "-Z": "-z"}
 _Named = TypeVar("_Named")
 _DAMAGE = (ValueError, EOFError, OSError, RuntimeError, MemoryError, zipfile.BadZipFile, zlib.error)
 _ARCHIVE_DAMAGE = (EOFError, OSError, RuntimeError, zipfile.BadZipFile, zlib.error)
@@ -90,11 +89,11 @@ def open_npy(path: Path) -> ArraySequence:
         raise _damaged(path, error) from error
 
 
-def open_npz_vertices(path: Path) -> ArraySequence:
+def open_npz_vertices(path: Path, said: Collection[str] = ()) -> ArraySequence:
     """Open the vertices in an ``.npz``: the key ``vertices``, or the only array (frames, n, 3).
 
     ``fps``, ``unit`` (``meters``, ``centimeters``, ``millimeters``) and ``up_axis`` (``Y``, ``Z``) are read
-    where they are there.
+    where they are there, and not among those that are `said` already.
 
     Raises:
         AssetError: no NPZ file, or damaged.
@@ -102,8 +101,8 @@ def open_npz_vertices(path: Path) -> ArraySequence:
     """
     with open_npz(path) as fields:
         fps = fields.number("fps") if "fps" in fields else None
-        metres = _named(fields, "unit", _UNITS) if "unit" in fields else None
-        up = _named(fields, "up_axis", _AXES) if "up_axis" in fields else None
+        metres = _named(fields, "unit", ANY_UNIT, "unit" in said)
+        up = _named(fields, "up_axis", _AXES, "up" in said)
     archive = zipfile.ZipFile(path)
     try:
         name, header = _vertex_member(path, archive)
@@ -116,15 +115,18 @@ def open_npz_vertices(path: Path) -> ArraySequence:
         archive.close()
 
 
-def _named(fields: NpzFields, key: str, known: Mapping[str, _Named]) -> _Named:
+def _named(fields: NpzFields, key: str, known: Mapping[str, _Named], said: bool) -> _Named | None:
+    """What a key says; None where it is not there, or another was said in place of one that is not known."""
+    if key not in fields:
+        return None
     value = fields.text(key)
     found = known.get(value) or known.get(value.upper())
-    if found is None:
+    if found is None and not said:
         raise fields.refuse(
             key,
             got=repr(value),
             expected=" or ".join(map(repr, known)),
-            fix=f"Correct the key '{key}' of the file.",
+            fix="Pass unit=m, cm or mm." if key == "unit" else "Pass up=y, z, -y or -z.",
         )
     return found
 
@@ -152,7 +154,9 @@ def _vertex_member(path: Path, archive: zipfile.ZipFile) -> tuple[str, ArrayHead
             f"{path}: {_KEY}",
             got=f"{shapes or 'no arrays'}: {len(fitting)} of them (frames, vertices, 3)",
             expected=f"a key '{_KEY}', or one array of that layout",
-            fix=f"Store the vertices under the key '{_KEY}'.",
+            fix="Motions are what soma convert input=FILE takes."
+            if "poses" in found or "local_rot_mats" in found
+            else f"Store the vertices under the key '{_KEY}'.",
         )
     return fitting[0], found[fitting[0]]
 

@@ -8,11 +8,13 @@ from typing import Literal
 
 from soma_core.errors import InputError
 from soma_core.files import refuse_unreadable
+from soma_core.io.npz_fields import say_overridden
 from soma_core.io.vertex_arrays import open_npy, open_npz_vertices
 from soma_core.io.vertex_folder import FolderSequence
 from soma_core.io.vertex_glb import GlbSequence
 from soma_core.io.vertex_sequence import UpAxis, VertexSequence
 from soma_core.io.vertex_usd import UsdSequence
+from soma_core.paths import expanded
 from soma_core.topology.frames import METRES
 
 __all__ = ["open_vertex_sequence"]
@@ -43,8 +45,15 @@ def open_vertex_sequence(
         AssetError: the file is missing, damaged or a git-LFS pointer.
         InputError: a format or a layout that is not read, or a frame rate that is not positive.
     """
-    path = Path(path).expanduser()
-    sequence = _open(path, allow_references=allow_references)
+    path = expanded(path)
+    said = [name for name, value in (("unit", unit), ("up", up)) if value is not None]
+    sequence = _open(path, said, allow_references=allow_references)
+    metres = sequence.metres
+    length = next((name for name, each in METRES.items() if each == metres), metres and f"{metres:g} m")
+    asked = {"fps": (fps, sequence.fps), "unit": (unit, length), "up": (up, sequence.up)}
+    for name, (given, own) in asked.items():
+        if given is not None and own is not None:
+            say_overridden(path, name, given=given, own=own)
     if fps is not None:
         sequence.fps = float(fps)
     if sequence.fps is not None and not (math.isfinite(sequence.fps) and sequence.fps > 0):
@@ -60,7 +69,7 @@ def open_vertex_sequence(
     return sequence
 
 
-def _open(path: Path, *, allow_references: bool) -> VertexSequence:
+def _open(path: Path, said: list[str], *, allow_references: bool) -> VertexSequence:
     if path.is_dir():
         return FolderSequence(path)
     refuse_unreadable(path)
@@ -74,4 +83,4 @@ def _open(path: Path, *, allow_references: bool) -> VertexSequence:
             expected=f"{', '.join((*_READERS, *_USD))} or a folder of .obj or .ply files",
             fix="Export the vertices in one of these formats.",
         )
-    return reader(path)
+    return reader(path, said) if reader is open_npz_vertices else reader(path)

@@ -13,6 +13,7 @@ from soma_core.errors import AssetError, InputError
 __all__ = ["UpAxis", "VertexSequence", "even_rate"]
 
 UpAxis = Literal["+y", "+z", "-y", "-z"]
+"""Upward axis of a world; -y is that of a camera's axes."""
 
 _SPACING_TOLERANCE = 1e-2
 """Largest departure of a time step from the others, relative: times are stored in float32."""

@@ -13,8 +13,9 @@ import torch
 
 from soma_core.errors import InputError
 from soma_core.io.motion import Motion
-from soma_core.io.motion_files import check_rig, read_motion
+from soma_core.io.motion_files import check_rig
 from soma_core.layer import SomaLayer
+from soma_core.motion.files import read
 from soma_core.motion.foot_lock import lock_feet
 from soma_core.motion.ground import (
     FootTrack,
@@ -27,7 +28,9 @@ from soma_core.motion.ground import (
     standing,
 )
 from soma_core.motion.identities import kept_identity
-from soma_core.options import Contacts, FrameRange, Ground, Translation
+from soma_core.motion.questions import Names, of_motion, say
+from soma_core.options import Contacts, FrameRange, Ground, LengthUnit, Translation
+from soma_core.paths import expanded
 from soma_core.progress import progress
 from soma_core.rig.manifest import shipped_file
 
@@ -69,6 +72,7 @@ def load_clip(
     *,
     fps: float | None = None,
     person: str | None = None,
+    unit: LengthUnit | str | None = None,
     frames: FrameRange | None = None,
 ) -> Motion:
     """Some frames of a motion file.
@@ -77,14 +81,16 @@ def load_clip(
         path: a motion on this skeleton; None for the clip that ships with the project.
         fps: frame rate, where the file has none.
         person: which sample of a file of several, ``0`` for the first.
+        unit: ``m``, ``cm`` or ``mm``, where the file does not say or is wrong.
         frames: which; None for all.
 
     Raises:
         SomaError: the file cannot be read.
         InputError: no frame is left.
     """
-    path = Path(path).expanduser() if path else shipped_file("motions/range_of_motion.npz")
-    motion, frames = read_motion(path, fps=fps, person=person), frames or FrameRange()
+    path = expanded(path) if path else shipped_file("motions/range_of_motion.npz")
+    motion, frames = read(path, fps=fps, unit=unit, person=person), frames or FrameRange()
+    say(path.name, of_motion(motion, Names(unit="motion_unit", fps="motion_fps", ups=())))
     part = slice(frames.start, frames.stop, frames.step)
     if part.step < 1 or not len(range(motion.frame_count)[part]):
         raise InputError(

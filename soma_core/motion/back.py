@@ -17,14 +17,16 @@ from soma_core.io.amass import SMPL_JOINTS
 from soma_core.json_file import read_json
 from soma_core.motion.chunks import FittedChunks
 from soma_core.motion.converter import Converted, earlier_report
-from soma_core.motion.files import ResultFiles, fingerprint, layout_of, read
+from soma_core.motion.files import ResultFiles, fingerprint, layout_of, no_motion, read
 from soma_core.motion.models import model_settings
 from soma_core.motion.native_errors import NativeErrors
 from soma_core.motion.native_results import NativeTarget, ParameterTarget, SmplTarget, VertexTarget
 from soma_core.motion.options import ConvertOptions
 from soma_core.motion.played import MovingBodies, Played, placing_of
+from soma_core.motion.questions import heard, of_motion, of_params, say
 from soma_core.native import NativeFit, NativeTransfer, ParameterFit
 from soma_core.options import Product, SmplLayout
+from soma_core.plugin.registry import default_registry
 from soma_core.progress import progress
 
 __all__ = ["BackConverter"]
@@ -48,16 +50,27 @@ class BackConverter:
     def __call__(self, path: Path, files: ResultFiles, chunks: Path) -> Converted:
         """Convert a file; see ``Converter``."""
         layout = layout_of(path)
+        if layout is None:
+            raise no_motion(path)[0]
         if layout not in ("soma", "kimodo"):
             raise InputError(
                 str(path),
-                got=f"the layout {layout}" if layout else "no motion under any key that is known",
+                got=f"the layout {layout}",
                 expected="a motion on this skeleton, for the way back",
                 fix="Convert it with to=soma first.",
             )
-        motion = read(path, fps=self._options.fps, unit=self._options.unit, person=self._options.person)
-        layer, stored = self._bodies.layer_of(path, motion)
-        target, placing = self._target(stored), placing_of(self._options)
+        options = self._options
+        with heard() as said:
+            motion = read(
+                path, fps=options.fps, unit=options.unit, angles=options.angles,
+                convention=options.convention, person=options.person,
+            )  # fmt: skip
+            layer, stored = self._bodies.layer_of(path, motion)
+            target, placing = self._target(stored), placing_of(options)
+            own = "" if options.backend is None else "backend.params."
+            say(path.name, of_motion(motion) + of_params(layer.spec, stored.get("params", {}), setting=own))
+            if isinstance(target, SmplTarget) and options.betas is not None:
+                say(path.name, of_params(target.fit.spec, target.params or {}, setting=""))
         settings = {
             "input": str(path.resolve()), "layout": layout, "fps": motion.fps, "body": stored["backend"],
             "body_params": stored.get("params"), **placing, **model_settings(layer), **target.facts,
@@ -75,7 +88,7 @@ class BackConverter:
             settings["found"] = target.params
         _convert_missing(body, target, kept)
         figures = target.write(kept, files, fps=motion.fps, source=motion.source)
-        report = {"settings": settings, **figures}
+        report = {"settings": settings, **figures, "warnings": said}
         atomic_text(files.report, json.dumps(report, indent=2, default=float) + "\n")
         kept.remove()
         return Converted(report=report, files=files, vertices=vertices, written=results)
@@ -93,21 +106,29 @@ class BackConverter:
         own = stored if stored["backend"] == name and "rest" not in stored else {}
         if name not in SMPL_JOINTS:
             return self._parameter_target(own, kind)
-        gender = str(chosen.gender or own.get("options", {}).get("gender", "neutral"))
+        kept = str(own.get("options", {}).get("gender", "neutral"))
+        gender = str(chosen.gender or kept)
+        own = own if gender == kept else {}  # its coefficients are another body in another gender's model
         params = {"betas": list(chosen.betas)} if chosen.betas is not None else own.get("params")
+        (width,) = default_registry().spec(name).params[0].shape
+        if chosen.betas is not None and len(chosen.betas) > width:
+            raise InputError(
+                "betas", got=f"{len(chosen.betas)} coefficients",
+                expected=f"at most {width}, as your {name} model has", fix="Leave the last ones out.",
+            )  # fmt: skip
         if gender not in self._targets:
             self._targets[gender] = NativeFit(name, options={"gender": gender}, **kind)
         fit = self._targets[gender]
         return SmplTarget(
             fit=fit, errors=NativeErrors(fit.transfer, kind["lod"]), model=name, gender=gender,
-            up=f"+{chosen.up or 'z'}", params=params, width=chosen.num_betas,
+            up=chosen.upward or "+z", params=params, width=chosen.num_betas,
             layout=str(chosen.layout or SmplLayout.amass),
         )  # fmt: skip
 
     def _parameter_target(self, own: Mapping[str, Any], kind: Mapping[str, Any]) -> NativeTarget:
         """What becomes of the body in a model whose pose is one vector."""
         chosen, name = self._options, self._options.to
-        for setting in ("up", "gender", "betas", "num_betas", "layout"):
+        for setting in ("up", "axes", "gender", "betas", "num_betas", "layout"):
             if getattr(chosen, setting) is not None:
                 raise InputError(
                     setting, got=str(getattr(chosen, setting)), expected=f"none with to={name}",

@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from soma_core.errors import AssetError, InputError
 from soma_core.io.amass import SmplMotion
+from soma_core.io.rotation_vectors import in_radians
 from soma_core.io.sam3d import Sam3dFrames, read_sam3d
 from soma_core.io.smpl_files import SmplChoices, read_smpl
 from soma_core.io.vertex_files import open_vertex_sequence
@@ -26,6 +26,7 @@ from soma_core.motion.models import (
 )
 from soma_core.motion.options import ConvertOptions, FitOptions, InvertOptions
 from soma_core.motion.posed_input import PosedInput
+from soma_core.motion.questions import of_params, of_rate, of_smpl
 from soma_core.plugin.errors import BackendError, BrokenBackendError
 from soma_core.plugin.registry import default_registry
 
@@ -34,8 +35,6 @@ if TYPE_CHECKING:
 
 __all__ = ["FITTED", "SMPL_LAYOUTS", "SMPL_SETTINGS", "ShownBody", "open_body"]
 
-_log = logging.getLogger(__name__)
-
 SMPL_LAYOUTS = ("amass", "smpl")
 """Layouts whose bodies are of the SMPL family."""
 
@@ -43,10 +42,7 @@ SMPL_SETTINGS = (
     "gender", "betas", "betas_from", "model", "person", "coordinates", "rotation_layout", "flat_hand_mean",
     "gaps", "longest_gap",
 )  # fmt: skip
-"""Options that only these layouts heed."""
-
-_UPRIGHT = 0.7
-"""Cosine between the mean upward direction of a body and that of its world, where people mostly stand."""
+"""Options that choose how their files are read."""
 
 _MHR, _DEFAULT = "mhr", "soma"
 _BONE_LENGTHS, _SCALES = slice(130, 136), slice(136, 204)
@@ -64,6 +60,7 @@ class ShownBody:
         search: choices of the search for an identity that is not known; empty if it is.
         facts: what else decides the result, for the report.
         licence: of the motion.
+        doubts: what is doubtful about it, for the log and the report.
     """
 
     backend: FitBackend
@@ -72,6 +69,7 @@ class ShownBody:
     search: Mapping[str, Any]
     facts: Mapping[str, Any]
     licence: str = ""
+    doubts: tuple[str, ...] = ()
 
 
 def open_body(path: Path, layout: str, options: FitOptions, backends: FitBackends | None = None) -> ShownBody:
@@ -99,8 +97,8 @@ def _vertex_body(path: Path, options: InvertOptions, backends: FitBackends) -> S
     sequence = open_vertex_sequence(
         path,
         fps=options.fps,
-        unit=str(options.unit) if options.unit else None,
-        up=f"+{options.up}" if options.up else None,
+        unit=options.unit_name,
+        up=options.upward,
         allow_references=options.allow_references,
     )
     try:
@@ -118,6 +116,7 @@ def _vertex_body(path: Path, options: InvertOptions, backends: FitBackends) -> S
         posed=posed,
         params=options.backend.params,
         search=_search(options),
+        doubts=tuple(of_rate(sequence.fps) + of_params(backend.layer.spec, options.backend.params)),
         facts={"unit_m": sequence.metres, "up": sequence.up, "topology": str(posed.topology)},
     )
 
@@ -134,7 +133,11 @@ def _smpl_body(path: Path, options: ConvertOptions, backends: FitBackends) -> Sh
         SomaError: the file cannot be read, or the user's model of that gender is not there.
     """
     motion = read_smpl(path, smpl_choices(options))
-    _warn_lying(path, motion)
+    motion = replace(
+        motion,
+        rotations=in_radians(path, motion.rotations, options.angles),
+        translation=motion.translation * (options.metres or 1.0),
+    )
     backend = _with_way_out(
         backends, motion.model, {"gender": motion.gender}, "carry=skeleton, which needs no model"
     )
@@ -146,8 +149,9 @@ def _smpl_body(path: Path, options: ConvertOptions, backends: FitBackends) -> Sh
         posed=PosedInput(sequence, backend.layer, topology="native"),
         params=params,
         search={},
-        facts={"up": motion.up, **_reading(options)},
+        facts={"up": motion.up, **_reading(options), **_units(options)},
         licence=f"that of {path.name}; body model: {backend.layer.spec.licence}",
+        doubts=tuple(of_smpl(motion) + of_params(backend.layer.spec, params, setting="")),
     )
 
 
@@ -160,7 +164,7 @@ def smpl_choices(options: ConvertOptions) -> SmplChoices:
     }
     if given.get("person") == "all":
         del given["person"]
-    return SmplChoices(**given | ({"up": f"+{options.up}"} if options.up else {}), fps=options.fps)
+    return SmplChoices(**given, up=options.upward, fps=options.fps)
 
 
 def _reading(options: ConvertOptions) -> dict[str, Any]:
@@ -217,15 +221,10 @@ def _usable_betas(path: Path, motion: SmplMotion, spec: BackendSpec, most: int |
     return [float(value) for value in betas]
 
 
-def _warn_lying(path: Path, motion: SmplMotion) -> None:
-    """Say so where people stand along another axis than the file's world is taken to have."""
-    upward = Rotation.from_rotvec(motion.rotations[:, 0]).apply([0, 1, 0]).mean(axis=0)
-    other = {"z": "+y", "y": "+z"}[motion.up[1]]
-    if upward["xyz".index(other[1])] > _UPRIGHT:
-        _log.warning(
-            "%s: the body stands along %s, but the world is taken to have %s up; if not so, pass up=%s",
-            path.name, other, motion.up, other[1],
-        )  # fmt: skip
+def _units(options: ConvertOptions) -> dict[str, str]:
+    """Units that a person gave for a file, for the report."""
+    given = {"unit": options.unit, "angles": options.angles}
+    return {name: str(value) for name, value in given.items() if value is not None}
 
 
 def _sam3d_body(path: Path, options: ConvertOptions, backends: FitBackends) -> ShownBody:
@@ -240,7 +239,7 @@ def _sam3d_body(path: Path, options: ConvertOptions, backends: FitBackends) -> S
             f"{path}: fps", got="none: SAM 3D Body sees pictures", expected="frames per second",
             fix="Pass fps=30 (or the true rate).",
         )  # fmt: skip
-    frames = read_sam3d(path)
+    frames = read_sam3d(path, axes=_sam3d_axes(options), unit=options.unit_name or "m")
     vertices = frames.vertices
     if frames.placement is not None:
         vertices = vertices + frames.placement[:, None]
@@ -255,7 +254,22 @@ def _sam3d_body(path: Path, options: ConvertOptions, backends: FitBackends) -> S
     return ShownBody(
         backend=backend, posed=posed, params=params, search=_search(options), facts={"up": "+y"},
         licence=f"that of {path.name}",
+        doubts=tuple(of_rate(options.fps) + ([] if known else of_params(backend.layer.spec, params))),
     )  # fmt: skip
+
+
+def _sam3d_axes(options: ConvertOptions) -> Literal["camera", "model"]:
+    """Axes of a SAM 3D Body file: the camera's, unless its vertices were turned upright already.
+
+    Raises:
+        InputError: another axis than these two.
+    """
+    if options.upward not in (None, "+y", "-y"):
+        raise InputError(
+            "up", got=str(options.up), expected="-y, as SAM 3D Body writes, or y for vertices turned back",
+            fix="Leave up out.",
+        )  # fmt: skip
+    return "model" if options.upward == "+y" else "camera"
 
 
 def _check_mhr_pair() -> None:

@@ -6,51 +6,21 @@ import logging
 from dataclasses import replace
 from pathlib import Path
 
-from soma_core.errors import InputError
 from soma_core.io.joint_names import read_mapping
 from soma_core.io.skeleton_files import read_skeleton
 from soma_core.io.smpl_files import read_smpl
 from soma_core.io.smpl_skeleton import smpl_skeleton
-from soma_core.motion.bodies import smpl_choices
+from soma_core.motion.bodies import SMPL_LAYOUTS, smpl_choices
 from soma_core.motion.options import ConvertOptions
 from soma_core.motion.retarget import Retargeted, retarget
 from soma_core.options import BoneMatch
 from soma_core.rig import load_canonical
 
-__all__ = ["SMPL_LAYOUTS", "carried", "check_carried"]
+__all__ = ["carried"]
 
 _log = logging.getLogger(__name__)
 
-SMPL_LAYOUTS = ("amass", "smpl")
-"""Layouts of the SMPL family."""
-
 _SHOWN = 12
-
-
-def check_carried(path: Path, layout: str, options: ConvertOptions) -> None:
-    """Refuse settings of skeletons for other files, and those of fits for skeletons.
-
-    Raises:
-        InputError: a setting that would change nothing.
-    """
-    skeleton = layout == "skeleton"
-    joints = skeleton or (layout in SMPL_LAYOUTS and options.carry == "skeleton")
-    unused = {
-        "carry": options.carry if options.carry != "fit" and layout not in SMPL_LAYOUTS else None,
-        "mapping": None if skeleton else options.mapping,
-        "root": None if skeleton else options.root,
-        "match": None if joints else options.match,
-        "gender": options.gender if skeleton else None,
-        "most_betas": options.most_betas if joints else None,
-    }
-    for name, value in unused.items():
-        if value is not None:
-            raise InputError(
-                name,
-                got=str(value),
-                expected=f"none for {path.name}, whose layout is {layout}",
-                fix=f"Leave {name} out.",
-            )
 
 
 def carried(path: Path, layout: str, options: ConvertOptions) -> Retargeted:
@@ -59,7 +29,7 @@ def carried(path: Path, layout: str, options: ConvertOptions) -> Retargeted:
     Raises:
         SomaError: the file cannot be read, or its joints are not known.
     """
-    up, match = str(options.up) if options.up else None, options.match
+    up, match = options.upward, options.match
     if layout in SMPL_LAYOUTS:
         motion = read_smpl(path, replace(smpl_choices(options), gender="neutral", betas=(0.0,) * 10))
         _log.warning("%s: betas are not read: joints are carried over, no body is fitted", path.name)

@@ -20,9 +20,10 @@ from soma_core.io.smpl_files import people_of
 from soma_core.motion.back import BackConverter
 from soma_core.motion.bodies import SMPL_LAYOUTS
 from soma_core.motion.converter import Converted, Converter
-from soma_core.motion.files import SUFFIXES, ResultFiles, layout_of
+from soma_core.motion.files import SUFFIXES, ResultFiles, layout_of, no_motion
 from soma_core.motion.options import ConvertOptions
 from soma_core.options import Picture
+from soma_core.paths import expanded
 
 __all__ = ["FolderConverted", "convert", "convert_file", "convert_folder", "convert_people"]
 
@@ -67,7 +68,7 @@ def convert_file(source: str | Path, out: str | Path, *, options: ConvertOptions
     """
     out = Path(out)
     convert = _converter(options or ConvertOptions())
-    return convert(Path(source).expanduser(), ResultFiles.of_folder(out), out / "chunks")
+    return convert(expanded(source), ResultFiles.of_folder(out), out / "chunks")
 
 
 def convert_people(
@@ -119,7 +120,7 @@ class FolderConverted:
     Attributes:
         converted: those that were converted, by this call or an earlier one.
         errors: what was wrong with those that were not.
-        skipped: those that hold no motion.
+        skipped: those that hold nothing of a motion; files with poses that cannot be read are errors.
     """
 
     converted: dict[str, Converted] = field(default_factory=dict)
@@ -147,7 +148,7 @@ def convert_folder(
     Raises:
         InputError: no file may hold a motion.
     """
-    folder, out = Path(folder).expanduser(), Path(out)
+    folder, out = expanded(folder), Path(out)
     if not folder.is_dir():
         raise InputError(
             str(folder), got="no folder", expected="one that holds motion files",
@@ -161,7 +162,8 @@ def convert_folder(
             expected="motion files, at any depth",
             fix="Name the folder that holds them.",
         )
-    convert, found, rows = _converter(options or ConvertOptions()), FolderConverted(), {}
+    convert = _converter(options or ConvertOptions(), refuse_unused=False)
+    found, rows = FolderConverted(), {}
     everyone = options is not None and options.person == EVERYONE
     try:
         for number, file in enumerate(files, start=1):
@@ -190,8 +192,8 @@ def _converters(
     return [(f"{name}/{called}", convert.of_person(person)) for person, called in people.items()]
 
 
-def _converter(options: ConvertOptions) -> Converter | BackConverter:
-    return Converter(options) if options.to == "soma" else BackConverter(options)
+def _converter(options: ConvertOptions, *, refuse_unused: bool = True) -> Converter | BackConverter:
+    return Converter(options, refuse_unused=refuse_unused) if options.to == "soma" else BackConverter(options)
 
 
 def _files(folder: Path) -> Iterator[Path]:
@@ -226,8 +228,12 @@ def _row(
     """Convert one file of a folder; what becomes of it as a row of the report, and in words."""
     try:
         if layout_of(file) is None:
+            reason, poses = no_motion(file)
+            if poses:
+                raise reason
             found.skipped.append(name)
-            return {"state": "skipped", "reason": "holds no motion"}, "holds no motion"
+            told = f"holds no motion: {reason.got}"
+            return {"state": "skipped", "reason": told}, told
         converted = convert(file, ResultFiles.mirrored(out, name), out / "chunks" / name)
     except Exception as error:  # one file never ends a batch
         refusal = error if isinstance(error, SomaError) else _unforeseen(file, error)
@@ -237,4 +243,5 @@ def _row(
     report = converted.report
     row = {"state": "converted", "layout": report["settings"]["layout"], "frames": report["frames"],
            "fps": report["settings"]["fps"], "error_mm": converted.error_mm}  # fmt: skip
+    row |= {"warnings": report["warnings"]} if report.get("warnings") else {}
     return row, str(converted)

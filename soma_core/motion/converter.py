@@ -14,14 +14,16 @@ from soma_core.errors import AssetError, InputError, SomaError
 from soma_core.io.motion import Motion
 from soma_core.io.motion_files import read_motion
 from soma_core.json_file import read_json
-from soma_core.motion.bodies import FITTED, SMPL_SETTINGS, open_body
-from soma_core.motion.carried import SMPL_LAYOUTS, carried, check_carried
+from soma_core.motion.bodies import FITTED, SMPL_LAYOUTS, open_body
+from soma_core.motion.carried import carried
 from soma_core.motion.chunks import refuse_other_settings
-from soma_core.motion.files import Layout, ResultFiles, layout_of, read, write
+from soma_core.motion.files import Layout, ResultFiles, layout_of, no_motion, read, write
 from soma_core.motion.fit_job import FitJob, FitPlan, fit_settings, plan_body
 from soma_core.motion.models import FitBackends
 from soma_core.motion.options import ConvertOptions, InvertOptions
 from soma_core.motion.products import BodyProducts
+from soma_core.motion.questions import heard, of_motion, say, unused_settings
+from soma_core.paths import expanded
 
 __all__ = ["Converted", "Converter", "earlier_report", "finish_fit", "invert", "plan_fit"]
 
@@ -76,15 +78,16 @@ class Converter:
 
     Args:
         options: of the conversion.
+        refuse_unused: whether settings are refused that do not apply to a file; otherwise it is said.
     """
 
-    def __init__(self, options: ConvertOptions) -> None:
-        self._options, self._backends = options, FitBackends(options)
+    def __init__(self, options: ConvertOptions, *, refuse_unused: bool = True) -> None:
+        self._options, self._backends, self._refuse_unused = options, FitBackends(options), refuse_unused
         self._products = BodyProducts(options) if options.shown else None
 
     def of_person(self, person: str) -> Converter:
         """The same for one person of a file of several, with the same backends and fits."""
-        other = Converter(replace(self._options, person=person))
+        other = Converter(replace(self._options, person=person), refuse_unused=self._refuse_unused)
         other._backends = self._backends
         return other
 
@@ -103,18 +106,18 @@ class Converter:
             InputError: it holds no motion, or was fitted before with other settings.
         """
         before = _products_before(files.report)
-        layout = _known_layout(path)
-        options = self._options
-        check_carried(path, layout, options)
+        layout, options = _known_layout(path), self._options
         retargeted = layout == "skeleton" or (layout in SMPL_LAYOUTS and options.carry == "skeleton")
         fitted = layout in FITTED and not retargeted
-        if retargeted:
-            found = _retargeted(path, layout, options, files)
-        elif fitted:
+        with heard() as said:
+            unused_settings(path, layout, options, refuse=self._refuse_unused)
+            if retargeted:
+                found = _retargeted(path, layout, options, files, said)
+            elif not fitted:
+                found = self._carry_over(path, layout, files, said)
+        if fitted:
             _refuse_chosen(path, options)
             found = self._fitted(path, layout, files, chunks)
-        else:
-            found = self._carry_over(path, layout, files)
         written = {"npz": files.motion}
         if self._products is not None:
             report = dict(found.report)
@@ -125,19 +128,27 @@ class Converter:
     def _fitted(self, path: Path, layout: Layout, files: ResultFiles, chunks: Path) -> Converted:
         """Fit the body of a file, or find that it was."""
         options = self._options
-        body = open_body(path, layout, options, self._backends)
-        earlier = earlier_report(
-            files.report, {"npz": files.motion}, fit_settings(path, layout, body, options)
-        )
+        with heard() as said:
+            body = open_body(path, layout, options, self._backends)
+            settings = fit_settings(path, layout, body, options)
+            earlier = earlier_report(files.report, {"npz": files.motion}, settings)
+            if earlier is None:
+                plan = plan_body(path, layout, body, options, files, chunks)
         if earlier is not None:
+            for warning in earlier.get("warnings", ()):
+                _log.warning("%s", warning)
             _refuse_failed(path, earlier, files.report)
             return Converted(report=earlier, files=files, earlier=True)
-        return _finished(FitJob(plan=plan_body(path, layout, body, options, files, chunks), body=body))
+        return _finished(FitJob(plan=replace(plan, warnings=tuple(said)), body=body))
 
-    def _carry_over(self, path: Path, layout: Layout, files: ResultFiles) -> Converted:
+    def _carry_over(self, path: Path, layout: Layout, files: ResultFiles, said: list[str]) -> Converted:
         """Write the rotations of a file on this skeleton as they are, in metres."""
-        _refuse_smpl_settings(path, layout, self._options)
-        motion = read(path, fps=self._options.fps, unit=self._options.unit, person=self._options.person)
+        options = self._options
+        motion = read(
+            path, fps=options.fps, unit=options.unit, angles=options.angles, convention=options.convention,
+            person=options.person,
+        )  # fmt: skip
+        say(path.name, of_motion(motion))
         write(motion, files.motion)
         report = {
             "settings": {"input": str(path.resolve()), "layout": layout, "fps": motion.fps},
@@ -145,6 +156,7 @@ class Converter:
             "convention": motion.convention,
             "identity": motion.identity.get("backend"),
             "rotations": "carried over as they are",
+            "warnings": said,
         }
         atomic_text(files.report, json.dumps(report, indent=2) + "\n")
         return Converted(report=report, files=files)
@@ -172,31 +184,17 @@ def _refuse_chosen(path: Path, options: ConvertOptions) -> None:
         )  # fmt: skip
 
 
-def _retargeted(path: Path, layout: Layout, options: ConvertOptions, files: ResultFiles) -> Converted:
+def _retargeted(
+    path: Path, layout: Layout, options: ConvertOptions, files: ResultFiles, said: list[str]
+) -> Converted:
     """Write the motion of another skeleton, and what became of each of its joints."""
     found = carried(path, layout, options)
     write(found.motion, files.motion)
     settings = {"input": str(path.resolve()), "layout": layout, "fps": found.motion.fps}
     report = {"settings": settings, "frames": found.motion.frame_count, "identity": None,
-              "rotations": "carried over by the skeleton", **found.report}  # fmt: skip
+              "rotations": "carried over by the skeleton", **found.report, "warnings": said}  # fmt: skip
     atomic_text(files.report, json.dumps(report, indent=2) + "\n")
     return Converted(report=report, files=files)
-
-
-def _refuse_smpl_settings(path: Path, layout: Layout, options: ConvertOptions) -> None:
-    """Refuse settings that would change nothing about a file of this skeleton.
-
-    Raises:
-        InputError: one of them is given.
-    """
-    plain = ConvertOptions()
-    for name in SMPL_SETTINGS:
-        value = getattr(options, name)
-        if name not in ("gender", "person") and value != getattr(plain, name):
-            raise InputError(
-                f"{path.name}: {name}", got=str(value), expected=f"none: a {layout} file has no use for it",
-                fix=f"Leave {name} out.",
-            )  # fmt: skip
 
 
 def _known_layout(path: Path) -> Layout:
@@ -207,12 +205,7 @@ def _known_layout(path: Path) -> Layout:
     """
     layout = layout_of(path)
     if layout is None:
-        raise InputError(
-            str(path),
-            got="no motion under any key that is known",
-            expected="a file of the SMPL family, SAM 3D Body, kimodo or SOMA, or a skeleton (BVH, GLB, USD)",
-            fix="Vertices over time are what soma invert takes.",
-        )
+        raise no_motion(path)[0]
     return layout
 
 
@@ -231,15 +224,18 @@ def invert(source: str | Path, out: str | Path, *, options: InvertOptions | None
         SomaError: the backend or the file cannot be used, or the fit is none; what there is of it is
             written all the same.
     """
-    source, out, options = Path(source).expanduser(), Path(out), options or InvertOptions()
-    body, files = open_body(source, "vertices", options), ResultFiles.of_folder(out)
+    source, out, options = expanded(source), Path(out), options or InvertOptions()
+    files = ResultFiles.of_folder(out)
+    with heard() as said:
+        body = open_body(source, "vertices", options)
     with body.posed.sequence as shown:
         _log.info(
             "%s: %d frames of %d vertices (%s) at %g fps",
             source.name, shown.frame_count, shown.vertex_count, body.posed.topology, shown.fps,
         )  # fmt: skip
-        plan = plan_body(source, "vertices", body, options, files, out / "chunks")
-        return _finished(FitJob(plan=plan, body=body))
+        with heard() as also:
+            plan = plan_body(source, "vertices", body, options, files, out / "chunks")
+        return _finished(FitJob(plan=replace(plan, warnings=(*said, *also)), body=body))
 
 
 def plan_fit(
@@ -257,7 +253,7 @@ def plan_fit(
         InputError: the file is of this skeleton, and needs no fit.
     """
     source, out = (
-        Path(source).expanduser().resolve(),
+        expanded(source).resolve(),
         Path(out).resolve(),
     )  # another process may stand elsewhere
     options = options or ConvertOptions()
@@ -266,9 +262,11 @@ def plan_fit(
         raise InputError(
             str(source), got=f"the layout {layout}", expected="a body to fit", fix="Convert or read it."
         )
-    body = open_body(source, layout, options)
-    with body.posed.sequence:
-        return plan_body(source, layout, body, options, ResultFiles.of_folder(out), out / "chunks")
+    with heard() as said:
+        body = open_body(source, layout, options)
+        with body.posed.sequence:
+            plan = plan_body(source, layout, body, options, ResultFiles.of_folder(out), out / "chunks")
+    return replace(plan, warnings=tuple(said))
 
 
 def finish_fit(plan: FitPlan) -> Converted:
@@ -289,7 +287,7 @@ def _finished(job: FitJob) -> Converted:
     for line in summary.as_text().splitlines() if vertices else ():
         _log.info("%s", line)
     report = _read_report(plan.files.report)
-    _refuse_failed(plan.source, report, plan.files.report, axes_known=not vertices)
+    _refuse_failed(plan.source, report, plan.files.report)
     return Converted(report=report, files=plan.files)
 
 
@@ -316,18 +314,15 @@ def earlier_report(
     return report
 
 
-def _refuse_failed(path: Path, report: Mapping[str, Any], file: Path, *, axes_known: bool = True) -> None:
-    """Refuse a fit that is none; where a body lies, readers say themselves that know a file's axes.
+def _refuse_failed(path: Path, report: Mapping[str, Any], file: Path) -> None:
+    """Refuse a fit that is none.
 
     Raises:
         SomaError: what is wrong with it.
     """
     found = report.get("diagnosis")
-    if not found or (axes_known and found["cause"] == "axis"):
-        return
-    if found["failed"]:
+    if found and found["failed"]:
         raise SomaError(f"{path}: {found['sentence']}; {file} has the figures.")
-    _log.warning("%s: %s", path.name, found["sentence"])
 
 
 def _read_report(path: Path) -> dict[str, Any]:

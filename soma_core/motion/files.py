@@ -3,26 +3,28 @@
 from __future__ import annotations
 
 import hashlib
+import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
 from soma_core.errors import InputError
-from soma_core.io.data_files import DATA_SUFFIXES
+from soma_core.io.data_files import DATA_SUFFIXES, open_data
 from soma_core.io.gem_x import gem_x_parts
-from soma_core.io.motion import Motion
+from soma_core.io.motion import Convention, Motion
 from soma_core.io.motion_files import read_motion, write_motion
 from soma_core.io.npz_fields import open_npz
 from soma_core.io.sam3d import SAM3D_SUFFIXES
 from soma_core.io.skeleton_files import SKELETON_SUFFIXES
+from soma_core.io.smpl_bodies import shown_names
 from soma_core.io.smpl_files import smpl_layout
-from soma_core.io.soma_npz import METRES_PER_UNIT
 from soma_core.motion.writers import WRITERS
 from soma_core.options import LengthUnit, Product
+from soma_core.paths import expanded
 from soma_core.rig import load_canonical
 from soma_core.topology.frames import METRES
 
-__all__ = ["SUFFIXES", "Layout", "ResultFiles", "fingerprint", "layout_of", "read", "write"]
+__all__ = ["SUFFIXES", "Layout", "ResultFiles", "fingerprint", "layout_of", "no_motion", "read", "write"]
 
 Layout = Literal["soma", "kimodo", "amass", "smpl", "sam3d", "skeleton"]
 
@@ -82,7 +84,7 @@ def layout_of(path: str | Path) -> Layout | None:
     Raises:
         AssetError: the file is missing, damaged, a git-LFS pointer or not what its suffix says.
     """
-    path = Path(path).expanduser()
+    path = expanded(path)
     suffix = path.suffix.lower()
     if suffix == ".parquet":
         return "sam3d"
@@ -101,12 +103,47 @@ def layout_of(path: str | Path) -> Layout | None:
     return smpl_layout(path, readable=soma) or ("soma" if soma else None)
 
 
+_POSE_KEY = re.compile(
+    r"(^|_)(full)?poses?(_|$)|orient|thetas?$|rot_?mats?|quat|axis_?angle|rotvec|(^|_)joints(_3d|_pos|$)|smpl",
+    re.IGNORECASE,
+)
+_CAMERA_KEY = re.compile(r"(^|_)cam", re.IGNORECASE)
+_WANTED = (
+    "poses, or root_orient and pose_body, beside trans (AMASS); global_orient and body_pose beside transl "
+    "(SMPL-X and video estimators); pred_vertices (SAM 3D Body); "
+    "local_rot_mats or global_rot_mats (kimodo); or poses beside transl (SOMA)"
+)
+
+
+def no_motion(path: Path) -> tuple[InputError, bool]:
+    """Why a file of no known layout is none, by its keys; and whether they are those of poses all the same.
+
+    Raises:
+        AssetError: the file is missing, damaged, a git-LFS pointer or not what its suffix says.
+    """
+    with open_data(path) as file:
+        top = file.content if isinstance(file.content, dict) else {}
+        names, shown = [str(name) for name in top], shown_names(file)
+    if path.suffix.lower() == ".npz":
+        shown = ", ".join(names)
+    vertices = any(name == "vertices" or name.endswith("_vertices") for name in names)
+    takes = "vertices over time are what soma invert input=FILE takes"
+    return InputError(
+        str(path),
+        got=f"the keys {shown or '(none)'}",
+        expected=_WANTED,
+        fix=f"{takes[0].upper()}{takes[1:]}." if vertices else f"Rename the keys in it; {takes}.",
+    ), any(_POSE_KEY.search(name) and not _CAMERA_KEY.search(name) for name in names)
+
+
 def read(
     path: str | Path,
     *,
     fps: float | None = None,
     unit: LengthUnit | str | None = None,
     person: str | None = None,
+    angles: Literal["rad", "deg"] | None = None,
+    convention: Convention | None = None,
 ) -> Motion:
     """Read a motion on this skeleton: a file of this project, of the SOMA tools or of kimodo.
 
@@ -115,6 +152,8 @@ def read(
         fps: frame rate, where the file has none.
         unit: ``m``, ``cm`` or ``mm``; overrides the file's own.
         person: which of the samples of kimodo or the people of GEM-X, from ``0``.
+        angles: unit of rotation vectors; None for radians.
+        convention: what zero means; overrides the file's own.
 
     Raises:
         AssetError: the file is missing, damaged, a git-LFS pointer or no NPZ.
@@ -124,9 +163,8 @@ def read(
         raise InputError(
             "unit", got=repr(unit), expected=f"one of {', '.join(METRES)}", fix="Correct the name."
         )
-    metres = METRES[str(unit)] if unit else None
-    name = next((name for name, length in METRES_PER_UNIT.items() if length == metres), None)
-    return read_motion(path, fps=fps, unit=name, person=person)
+    name = None if unit is None else str(unit)
+    return read_motion(path, fps=fps, unit=name, angles=angles, convention=convention)
 
 
 def write(motion: Motion, path: str | Path) -> None:

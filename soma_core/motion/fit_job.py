@@ -25,6 +25,7 @@ from soma_core.motion.ground import skeleton_of
 from soma_core.motion.identities import found_identity, stored_identity
 from soma_core.motion.models import model_settings
 from soma_core.motion.options import FitOptions
+from soma_core.motion.questions import heard, of_path, say
 from soma_core.options import Upward
 from soma_core.progress import progress
 
@@ -54,6 +55,7 @@ class FitPlan:
         chunks: where finished parts are kept.
         settings: what decides the result, for the report.
         files: where the results go.
+        warnings: what was said while it was planned, for the report.
     """
 
     source: Path
@@ -63,6 +65,7 @@ class FitPlan:
     chunks: FittedChunks
     settings: Mapping[str, Any]
     files: ResultFiles
+    warnings: tuple[str, ...] = ()
 
     def missing(self) -> list[int]:
         """Numbers of the chunks that are still to be fitted."""
@@ -128,10 +131,13 @@ def plan_body(
     """
     layer, posed = body.backend.layer, body.posed
     settings = fit_settings(source, layout, body, options)
+    say(source.name, body.doubts)
     with torch.no_grad():
         identity = layer.identity(body.params)
         posed.check_size(layer, identity)
-        _refuse_unfit(body.backend.inversion, posed, identity)
+        found = _refuse_unfit(body.backend.inversion, posed, identity)
+    if found is not None and layout == "vertices":  # other readers say themselves where a body lies
+        say(source.name, [found.sentence])
     made_from = {**settings, "shown": options.picture.frames}
     kept = FittedChunks(chunks, made_from, frame_count=posed.sequence.frame_count, size=options.chunk)
     stored = {"backend": layer.backend, "params": body.params}
@@ -205,23 +211,37 @@ class FitJob:
         )  # fmt: skip
         frames = per_frame(chunks)
         atomic_write(files.frames, lambda path: np.savez_compressed(path, **frames))
-        unusable = np.flatnonzero(~frames["valid"])
-        if len(unusable):
-            _log.warning(
-                "%d frames could not be used and hold the T-pose, the first is %d; %s lists them",
-                len(unusable), unusable[0], files.frames.name,
-            )  # fmt: skip
         draw_worst(
             files.picture, chunks, layer, self.identity,
             count=picture.frames, apart=self._apart, width=picture.width,
         )  # fmt: skip
         report = joined_report(chunks, layer)
         found = self._diagnosis(frames["mean_error"])
-        told = None if found is None else asdict(found)
-        document = {"settings": dict(plan.settings), **report.as_dict(), "diagnosis": told}
+        with heard() as said:
+            self._question(frames["valid"], found)
+        document = {
+            "settings": dict(plan.settings), **report.as_dict(),
+            "diagnosis": None if found is None else asdict(found), "warnings": [*plan.warnings, *said],
+        }  # fmt: skip
         atomic_text(files.report, json.dumps(document, indent=2, default=float) + "\n")
         chunks.remove()
         return report
+
+    def _question(self, valid: np.ndarray, found: Diagnosis | None) -> None:
+        """Warn of what the fit tells about the file: frames without a body, a doubtful fit, the path."""
+        plan, unusable = self.plan, np.flatnonzero(~valid)
+        doubts = []
+        if len(unusable):
+            doubts = [
+                f"{len(unusable)} frames could not be used and hold the T-pose, the first is {unusable[0]}; "
+                f"{plan.files.frames.name} lists them"
+            ]
+        if found is not None and not found.failed and found.cause != "axis":
+            doubts.append(found.sentence)
+        if plan.layout != "amass" and valid.sum() > 1:  # its path was asked about before the fit
+            path = np.concatenate([path for (path,) in plan.chunks.load_all("translation")])[valid]
+            doubts += of_path(path, plan.settings["fps"], up="+y", what="the fit")
+        say(plan.source.name, doubts)
 
     def _diagnosis(self, errors: np.ndarray) -> Diagnosis | None:
         """What is wrong with the fit, by some of its frames and their mean errors [m], NaN where unusable."""
@@ -244,8 +264,11 @@ def _diagnosed(
     return diagnose_fit(layer, identity, canonical, axes=posed.axes, ups=[*Upward], **known)
 
 
-def _refuse_unfit(inversion: PoseInversion, posed: PosedInput, identity: Identity) -> None:
+def _refuse_unfit(inversion: PoseInversion, posed: PosedInput, identity: Identity) -> Diagnosis | None:
     """Look at some frames before a fit, and refuse vertices that no pose of any body explains.
+
+    Returns:
+        That the body lies or stands on its head; None otherwise.
 
     Raises:
         SomaError: they are mirrored, or in another order.
@@ -254,6 +277,7 @@ def _refuse_unfit(inversion: PoseInversion, posed: PosedInput, identity: Identit
     found = _diagnosed(inversion, posed, identity, vertices)
     if found is not None and found.failed and found.cause in ("order", "mirrored"):
         raise SomaError(f"{posed.sequence.path}: {found.sentence}.")
+    return found if found is not None and found.cause == "axis" else None
 
 
 def _margin(inversion: PoseInversion) -> int:

@@ -16,7 +16,9 @@ from soma_core.errors import InputError
 from soma_core.inversion import IdentityFit, fit_identity
 from soma_core.io.motion import Motion
 from soma_core.layer import SomaLayer
+from soma_core.motion.models import under
 from soma_core.motion.posed_input import PosedInput
+from soma_core.options import IdentityChoice
 from soma_core.rig import load_canonical
 from soma_core.skeleton.identity import Identity
 
@@ -109,13 +111,14 @@ def _search(
     """Fit to frames spread over the sequence, read one by one; gaps are avoided where there is a choice."""
     numbers, vertices = posed.spread(max(choice["frames"], 1))
     _log.info("finding the identity from %d frames", len(numbers))
-    found = fit_identity(
-        layer,
-        torch.as_tensor(vertices).to(layer.device, layer.dtype),
-        topology=posed.topology,
-        start=params,
-        **choice,
-    )
+    with under(IdentityChoice, "identity"):
+        found = fit_identity(
+            layer,
+            torch.as_tensor(vertices).to(layer.device, layer.dtype),
+            topology=posed.topology,
+            start=params,
+            **choice,
+        )
     short = {name: value.item() for name, value in found.params.items() if value.numel() == 1}
     if short:
         _log.info("found %s", ", ".join(f"{name}={value:.3g}" for name, value in short.items()))

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+import re
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +21,7 @@ from soma_core.inversion.options import inversion_options
 from soma_core.io.vertex_sequence import UpAxis, VertexSequence
 from soma_core.layer import SomaLayer
 from soma_core.motion.options import FitOptions
-from soma_core.options import ModelOptions
+from soma_core.options import InversionChoice, ModelOptions, Options
 from soma_core.plugin.registry import default_registry
 from soma_core.plugin.spec import HasPosed, HasSkinning
 from soma_core.rig import load_canonical
@@ -35,6 +37,7 @@ __all__ = [
     "TransferredSequence",
     "model_settings",
     "open_layer",
+    "under",
 ]
 
 
@@ -109,6 +112,20 @@ class FitBackend:
         return generator
 
 
+@contextmanager
+def under(group: type[Options], name: str) -> Iterator[None]:
+    """Name settings of a group in full where they are refused: ``tolerance`` is ``inversion.tolerance``."""
+    try:
+        yield
+    except InputError as error:
+        if error.argument.partition(".")[0] not in {field.name for field in fields(group)}:
+            raise
+        fix = re.sub(r"\b(Pass|Leave) (\w+)(?==| out)", rf"\1 {name}.\2", error.fix)
+        raise InputError(
+            f"{name}.{error.argument}", got=error.got, expected=error.expected, fix=fix
+        ) from error
+
+
 class FitBackends:
     """Layers with their fits, each made when it is first asked for.
 
@@ -131,7 +148,8 @@ class FitBackends:
         if key not in self._made:
             layer, choice = open_layer(self._options, name, options), asdict(self._options.inversion)
             kernels = str(choice.pop("kernels"))
-            inversion = PoseInversion(layer, **inversion_options(choice), kernels=kernels)
+            with under(InversionChoice, "inversion"):
+                inversion = PoseInversion(layer, **inversion_options(choice), kernels=kernels)
             self._made[key] = FitBackend(layer=layer, inversion=inversion)
         return self._made[key]
 

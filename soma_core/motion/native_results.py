@@ -21,10 +21,11 @@ from soma_core.motion.chunks import FittedChunks
 from soma_core.motion.files import ResultFiles
 from soma_core.motion.native_errors import NativeErrors
 from soma_core.motion.played import Played
+from soma_core.motion.posed_input import world_axes
 from soma_core.motion.writers import WRITERS
 from soma_core.native import NativeFit, NativeTransfer, ParameterFit
 from soma_core.options import Product
-from soma_core.topology.frames import METRES, native_to_canonical
+from soma_core.topology.frames import METRES
 
 __all__ = ["NativeTarget", "ParameterTarget", "SmplTarget", "VertexTarget"]
 
@@ -160,9 +161,8 @@ class SmplTarget:
 
     def arrays(self, vertices: Tensor) -> dict[str, np.ndarray]:
         """Parameters of the frames, and statistics of the error."""
-        if self.up == "+z":  # the fit does not care which way a body is turned
-            turn = torch.as_tensor(native_to_canonical("+z", "-y")).to(vertices)
-            vertices = vertices @ turn
+        if self.up != "+y":  # the fit does not care which way a body is turned
+            vertices = vertices @ torch.as_tensor(world_axes(self.up)).to(vertices)
         found = self.fit(vertices, params=self.params)
         return {
             "rotations": found.rotations.float().cpu().numpy(),

@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, cast
 
 from soma_core.errors import InputError
+from soma_core.io.vertex_sequence import UpAxis
 from soma_core.motion.writers import MESH_WRITERS, WriteOptions
 from soma_core.options import (
+    AngleUnit,
+    Axes,
     BackendChoice,
     BetasFrom,
     BodyGender,
@@ -26,14 +30,23 @@ from soma_core.options import (
     Picture,
     Product,
     RotationLayout,
+    RotationZero,
     SmplLayout,
     SmplModel,
     Topology,
     Translation,
     Upward,
 )
+from soma_core.topology.frames import METRES
+
+if TYPE_CHECKING:
+    from soma_core.plugin.spec import Unit
 
 __all__ = ["ConvertOptions", "FitOptions", "InvertOptions", "SourceOptions"]
+
+
+SIGNED: dict[str, UpAxis] = {"y": "+y", "z": "+z", "-y": "-y", "-z": "-z"}
+"""Upward axes as readers take them, by their settings."""
 
 
 @dataclass(kw_only=True)
@@ -46,7 +59,8 @@ class SourceOptions(Options):
         inversion: how poses are found.
         fps: frames per second.
         unit: of lengths.
-        up: upward axis.
+        up: upward axis of the world.
+        axes: of the world by name, instead: ``camera`` has y down and z forward.
     """
 
     backend: BackendChoice | None = None
@@ -55,6 +69,24 @@ class SourceOptions(Options):
     fps: float | None = None
     unit: LengthUnit | None = None
     up: Upward | None = None
+    axes: Axes | None = None
+
+    @property
+    def upward(self) -> UpAxis | None:
+        """Upward axis with its sign, by either setting; None where neither is given."""
+        if self.axes is not None:
+            return "-y"
+        return None if self.up is None else SIGNED[str(self.up)]
+
+    @property
+    def unit_name(self) -> Unit | None:
+        """The unit as readers take it."""
+        return None if self.unit is None else cast("Unit", str(self.unit))
+
+    @property
+    def metres(self) -> float | None:
+        """Length of the unit [m]."""
+        return None if self.unit_name is None else METRES[self.unit_name]
 
 
 @dataclass(kw_only=True)
@@ -72,8 +104,13 @@ class FitOptions(ModelOptions, SourceOptions):
     picture: Picture = field(default_factory=lambda: Picture(frames=0))
 
     def __post_init__(self) -> None:
-        """Refuse a chunk of no frames."""
+        """Refuse a chunk of no frames, and two names of an axis that differ."""
         super().__post_init__()
+        if self.axes is not None and self.up not in (None, "-y"):
+            raise InputError(
+                "axes", got=f"{self.axes} beside up={self.up}", expected="one of the two",
+                fix="A camera's axes have up=-y.",
+            )  # fmt: skip
         if self.chunk < 1:
             raise InputError("chunk", got=self.chunk, expected="at least 1", fix="Try chunk=256.")
 
@@ -106,6 +143,8 @@ class ConvertOptions(WriteOptions, FitOptions):
         result: of the way back; None: poses of SMPL models, vertices of others.
         gender: of SMPL models; None: that of the file.
         most_betas: how many of a file's shape coefficients are used; None: all.
+        angles: unit of a file's rotation vectors; None: radians.
+        convention: zero of the rotations in a file on this skeleton; None: as the file says.
         betas: shape coefficients of SMPL models; None: those of the file, on the way back the body's own, or
             the nearest.
         betas_from: what is made of a file's shapes for each frame.
@@ -137,6 +176,8 @@ class ConvertOptions(WriteOptions, FitOptions):
     result: ConvertResult | None = None
     gender: BodyGender | None = None
     most_betas: int | None = None
+    angles: AngleUnit | None = None
+    convention: RotationZero | None = None
     betas: list[float] | None = None
     betas_from: BetasFrom = BetasFrom.mean
     model: SmplModel | None = None

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from soma_core.plugin.spec import Axis
     from soma_core.skeleton.identity import Identity
 
-__all__ = ["PosedInput"]
+__all__ = ["PosedInput", "world_axes"]
 
 _FORWARD: dict[str, Axis] = {
     "+y": "+z", "+z": "-y", "-y": "-z", "-z": "+y", "+x": "+z", "-x": "+z",
@@ -28,8 +28,9 @@ _FORWARD: dict[str, Axis] = {
 _NEARBY = 4
 """How many frames are looked at for one without gaps."""
 
-_SAME_SIZE = 3.0
-"""A body curls up to half its extent; three times more or less is another unit."""
+_SAME_SIZE, _OTHER_AGE = 3.0, 5.0
+"""A body curls up to half its extent; three times more or less is another unit, if there is one that fits, or
+an adult in place of a newborn, and five times no body."""
 
 
 class PosedInput:
@@ -109,7 +110,7 @@ class PosedInput:
         and a fit says so.
 
         Raises:
-            InputError: no frame among the first ones is usable, or the size is off by more than threefold.
+            InputError: another unit fits where the size is off threefold, or none where it is off fivefold.
         """
         unit = METRES[layer.spec.unit] if self.topology == "native" else 1.0
         expected = _extent(identity.fitted_rest[:1].detach().cpu().double().numpy())[0]
@@ -119,14 +120,18 @@ class PosedInput:
             return
         told = _metres(self.sequence, layer, self.topology)
         name = next((unit for unit, metres in METRES.items() if metres == told), f"units of {told:g} m")
-        fitting = min(METRES, key=lambda name: abs(np.log(sizes[0] / told * METRES[name] / expected)))
-        if fitting == name:
+        off = {unit: abs(np.log(sizes[0] / told * metres / expected)) for unit, metres in METRES.items()}
+        fitting = min(METRES, key=lambda unit: off[unit])
+        close = off[fitting] < np.log(_SAME_SIZE)
+        if not close and abs(np.log(sizes[0] / expected)) < np.log(_OTHER_AGE):
             return
+        mend = f"If the file is in {fitting}, pass unit={fitting}"
+        other = "m, cm and mm do not fit: look at backend= and its parameters, or at the scale of the export"
         raise InputError(
             str(self.sequence.path),
             got=f"a body {sizes[0] / expected:.3g} times as large as its identity, for lengths in {name}",
             expected="about the same size",
-            fix=f"If the file is in {fitting}, pass unit={fitting}.",
+            fix=f"{mend if close else other}.",
         )
 
 
@@ -184,7 +189,8 @@ def _metres(sequence: VertexSequence, layer: SomaLayer, topology: Topology) -> f
     return METRES[layer.spec.unit] if topology == "native" else 1.0
 
 
-def _axes(up: UpAxis) -> np.ndarray:
+def world_axes(up: UpAxis) -> np.ndarray:
+    """Rotation (3, 3) from a world of which only the upward axis is known to +Y up, +Z forward."""
     return native_to_canonical(up, _FORWARD[up])
 
 
@@ -197,7 +203,7 @@ def _canonical_frame(sequence: VertexSequence) -> np.ndarray:
             expected="m, cm or mm",
             fix="Pass unit=m (or the true unit).",
         )
-    return sequence.metres * _axes(sequence.up or "+y")
+    return sequence.metres * world_axes(sequence.up or "+y")
 
 
 def _native_frame(sequence: VertexSequence, layer: SomaLayer) -> np.ndarray:
@@ -206,7 +212,7 @@ def _native_frame(sequence: VertexSequence, layer: SomaLayer) -> np.ndarray:
     scale = _metres(sequence, layer, "native") / METRES[spec.unit]
     if sequence.up in (None, spec.up):
         return scale * np.eye(3)
-    return scale * native_to_canonical(spec.up, spec.forward).T @ _axes(sequence.up)
+    return scale * native_to_canonical(spec.up, spec.forward).T @ world_axes(sequence.up)
 
 
 def _extent(vertices: np.ndarray) -> np.ndarray:

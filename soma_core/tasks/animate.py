@@ -10,11 +10,13 @@ from typing import TYPE_CHECKING
 import torch
 from omegaconf import OmegaConf
 
+from soma_core.errors import InputError
 from soma_core.motion.animated import animate, load_clip
 from soma_core.motion.identities import backend_of, stored_identity
 from soma_core.motion.models import open_layer
 from soma_core.motion.played import Played
 from soma_core.motion.products import write_products
+from soma_core.motion.questions import of_params, say
 from soma_core.motion.writers import WRITERS
 
 if TYPE_CHECKING:
@@ -43,8 +45,17 @@ def run(config: DictConfig, output: Path) -> None:
         draw_gallery(options, output / "gallery.png")
         return
     options.refuse_unused(options.write)
-    motion = load_clip(options.motion, fps=options.motion_fps, person=options.person, frames=options.frames)
+    motion = load_clip(
+        options.motion, fps=options.motion_fps, unit=options.motion_unit, person=options.person,
+        frames=options.frames,
+    )  # fmt: skip
     kept, chosen = options.identity_from == "motion", options.backend
+    if kept and chosen.params:
+        key, value = next(iter(chosen.params.items()))
+        raise InputError(
+            f"backend.params.{key}", got=value, expected="none with identity_from=motion",
+            fix=f"Leave backend.params.{key} out, or identity_from=motion.",
+        )  # fmt: skip
     name, own = chosen.name, chosen.options
     if kept:
         name, own = backend_of(motion), {**motion.identity.get("options", {}), **own}
@@ -52,6 +63,10 @@ def run(config: DictConfig, output: Path) -> None:
     stored = dict(motion.identity) if kept else {"backend": layer.backend, "params": chosen.params}
     stored |= {"options": layer.options} if layer.options else {}
     _log.info("%s: %d frames at %g fps", motion.source, motion.frame_count, motion.fps)
+    say(
+        layer.backend,
+        of_params(layer.spec, stored.get("params", {}), setting="" if kept else "backend.params."),
+    )
     with torch.no_grad():
         identity = stored_identity(layer, stored)
         placed = animate(

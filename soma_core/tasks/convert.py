@@ -16,6 +16,7 @@ from soma_core.motion.conversion import (
     convert_folder,
     convert_people,
 )
+from soma_core.paths import expanded
 
 if TYPE_CHECKING:
     from omegaconf import DictConfig
@@ -38,7 +39,7 @@ def run(config: DictConfig, output: Path) -> None:
         raise InputError(
             "input", got="none", expected="a motion file, or a folder of them", fix="Pass input=FILE."
         )
-    path = Path(options.input).expanduser()
+    path = expanded(options.input)
     if not path.exists():
         raise AssetError(path, cause="file is missing", fix="Check the path.")
     try:

@@ -49,7 +49,10 @@ def draw_gallery(options: AnimateConfig, path: Path) -> None:
     Raises:
         SomaError: no backend is usable, or pyvista is not installed.
     """
-    motion = load_clip(options.motion, fps=options.motion_fps, person=options.person, frames=options.frames)
+    motion = load_clip(
+        options.motion, fps=options.motion_fps, unit=options.motion_unit, person=options.person,
+        frames=options.frames,
+    )  # fmt: skip
     frame = motion.frame_count // 2 if options.motion else round(_POSE_SECOND * motion.fps)
     frame = min(frame, motion.frame_count - 1)
     pose = motion.cut(slice(frame, frame + 1))

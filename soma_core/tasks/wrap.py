@@ -12,6 +12,7 @@ from omegaconf import OmegaConf
 from soma_core.errors import AssetError, InputError
 from soma_core.json_file import read_json
 from soma_core.options import BackendChoice
+from soma_core.paths import expanded
 from soma_core.plugin.registry import default_registry
 from soma_core.plugin.spec import WrapPair
 from soma_core.registration.native_mesh import NativeMesh, neutral_mesh, read_native_mesh
@@ -37,10 +38,14 @@ def run(config: DictConfig, output: Path) -> None:
         SomaError: the mesh cannot be read, is broken, or shows no human body.
     """
     mesh, _ = load_canonical("mid")
+    folder = expanded(config.out) if config.out else output
+    if folder.exists() and not folder.is_dir():
+        raise InputError(
+            "out", got=f"{folder}, a file", expected="a folder, or a new name", fix="Pass out=DIR."
+        )
     native = _read_native(config)
     found = register(native.vertices, native.triangles, options=_options(config, native))
     quality = measure(found, mesh)
-    folder = Path(config.out).expanduser() if config.out else output
     pair = write_pair(folder, found, mesh, vertices=native.vertices, triangles=native.triangles,
                       name=native.name, source=native.file)  # fmt: skip
     write_report(folder, found, quality, native=pair.native.name)
@@ -84,7 +89,7 @@ def _read_native(config: DictConfig) -> NativeMesh:
     if chosen:
         backend: BackendChoice = OmegaConf.to_object(config.backend)
         return neutral_mesh(default_registry(), backend.name, options=backend.options, params=backend.params)
-    return read_native_mesh(Path(config.native).expanduser())
+    return read_native_mesh(expanded(config.native))
 
 
 def _options(config: DictConfig, native: NativeMesh) -> WrapOptions:
@@ -122,7 +127,7 @@ def _json(name: str | Path | None, kind: type, expected: str) -> Any:
     """Content of a JSON file of integers, empty where none is named."""
     if name is None:
         return kind()
-    path = Path(name).expanduser()
+    path = expanded(name)
     content = read_json(path, fix=f"Write {expected} as JSON.")
     try:
         items = [*content, *content.values()] if isinstance(content, dict) else content

@@ -7,13 +7,16 @@ import numpy as np
 from soma_core.errors import InputError
 from soma_core.plugin.spec import Axis, Unit
 
-__all__ = ["METRES", "METRES_PER_UNIT", "native_to_canonical"]
+__all__ = ["ANY_UNIT", "METRES", "METRES_PER_UNIT", "native_to_canonical"]
 
 METRES: dict[Unit, float] = {"m": 1.0, "cm": 0.01, "mm": 0.001}
 """Length of one native unit in metres."""
 
 METRES_PER_UNIT = {"meters": METRES["m"], "centimeters": METRES["cm"], "millimeters": METRES["mm"]}
 """The same by the names that files of the SOMA tools have for them."""
+
+ANY_UNIT: dict[str, float] = METRES_PER_UNIT | {str(unit): metres for unit, metres in METRES.items()}
+"""The same by either name."""
 
 
 def _direction(axis: Axis, argument: str) -> np.ndarray:

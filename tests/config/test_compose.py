@@ -12,6 +12,7 @@ import yaml
 from omegaconf import DictConfig
 
 from soma_core.config.compose import run_task
+from soma_core.config.refusals import with_settings
 from soma_core.errors import InputError, SomaError
 from soma_core.plugin.errors import UnknownBackendError
 from soma_core.plugin.known import KNOWN_BACKENDS
@@ -135,3 +136,18 @@ def test_a_backend_that_is_not_installed_is_reported_in_our_words(
         run("backend=absent")
     with pytest.raises(UnknownBackendError, match='"absent"'):
         run("--multirun", "backend=soma,absent")
+
+
+@pytest.mark.parametrize("device", ["cuda:97", "gpu"])
+def test_a_device_that_is_not_there_is_refused_before_anything_runs(run: Run, device: str) -> None:
+    (error,) = run(f"device={device}")
+    assert isinstance(error, InputError)
+    assert str(error).startswith(f"device: got '{device}' (")
+    assert str(error).endswith("Pass device=cpu.")
+
+
+def test_a_parameter_is_named_by_its_setting() -> None:
+    error = with_settings(InputError("params['shape']", got=1, expected=2, fix="Reshape the value."))
+    assert str(error).startswith("backend.params.shape: got 1, expected 2. Correct backend.params.shape")
+    other = InputError("shape", got=1, expected=2, fix="Look.")
+    assert with_settings(other) is other

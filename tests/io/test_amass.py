@@ -152,3 +152,37 @@ def test_extra_arrays_that_are_refused(tmp_path, extra, said):
     with pytest.raises(InputError, match=said):
         write_amass(motion, tmp_path / "m.npz", extra=extra)
     assert not (tmp_path / "m.npz").exists()
+
+
+@pytest.mark.parametrize(
+    ("changes", "fps", "told"),
+    [
+        ({}, 60, None),
+        ({"mocap_time_length": (FRAMES - 1) / 60}, 60, None),  # the last frame takes no time
+        ({"mocap_framerate": 120.0}, 60, "mocap_frame_rate=60 is taken for the frame rate, against mocap_f"),
+        ({"mocap_framerate": 120.0, "mocap_time_length": FRAMES / 120}, 120, "mocap_framerate=120 is taken"),
+        (
+            {"mocap_time_length": 5.0},
+            60,
+            "against mocap_time_length=5, which 4 frames last at 0.8; pass fps=",
+        ),
+        ({"mocap_framerate": 240.0, "mocap_time_length": None}, 240, "against mocap_frame_rate=60;"),
+    ],
+)
+def test_rates_that_disagree_are_told(tmp_path, caplog, changes, fps, told):
+    file = written(tmp_path, smplx_file(**changes))
+    assert read_amass(file).fps == fps
+    assert (told in caplog.text) if told else not caplog.text
+    caplog.clear()
+    read_amass(file, fps=24)
+    assert "m.npz: fps=24 is taken in place of the file's own" in caplog.text
+
+
+@pytest.mark.parametrize(("own", "told"), [("smplx_locked_head", True), ("smplh", True), ("smplx", False)])
+def test_betas_of_another_model_or_gender_are_told(tmp_path, caplog, own, told):
+    file = written(tmp_path, smplx_file(surface_model_type=own))
+    read_amass(file, gender="neutral")
+    assert (f"the betas belong to the model '{own}'" in caplog.text) == told
+    assert "gender" not in caplog.text
+    read_amass(file, gender="male")
+    assert "gender=male is taken in place of the file's own, neutral" in caplog.text

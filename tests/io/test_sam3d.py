@@ -70,7 +70,7 @@ def test_vertices_turned_back_already_are_taken_as_they_are(tmp_path, caplog):
     assert not caplog.records
     with caplog.at_level(logging.WARNING):
         read_sam3d(path)
-    assert "upside down in most frames; if that is not its pose, read with axes='model'" in caplog.text
+    assert "upside down in most frames; if that is not its pose, pass up=y" in caplog.text
 
 
 @pytest.mark.parametrize(
@@ -82,8 +82,8 @@ def test_vertices_turned_back_already_are_taken_as_they_are(tmp_path, caplog):
         ({"shape_params": np.zeros(45, int)}, "shape_params: got shape .45,., dtype int64"),
         ({"mhr_model_params": np.zeros((2, 204), "f4")}, "mhr_model_params: got 2 frames, expected as many"),
         ({"pred_cam_t": np.float32([0, np.nan, 0])}, r"pred_cam_t: got nan at index \(0, 1\)"),
-        ({"pred_vertices": 100 * _person()["pred_vertices"]}, "a body of 170, as in centimetres.*by 100"),
-        ({"pred_vertices": 1000 * _person()["pred_vertices"]}, "a body of 1700, expected metres.*Scale them"),
+        ({"pred_vertices": 100 * _person()["pred_vertices"]}, "a body of 170 m, as of a file in cm.*=cm"),
+        ({"pred_vertices": 1000 * _person()["pred_vertices"]}, "of 1700 m, as of a file in mm.*unit=mm"),
         ({"pred_vertices": np.zeros((0, MHR_VERTICES, 3), "f4")}, "pred_vertices: got 0 frames"),
         ({"pred_vertices": np.array([{}], object)}, "pred_vertices: got an unreadable array .Python objects"),
     ],

@@ -153,10 +153,37 @@ def test_a_motion_without_a_body_needs_one(tmp_path):
     ("keys", "said"),
     [
         ({"poses": 0, "trans": 0}, "got the layout amass, expected a motion on this skeleton"),
-        ({"betas": 0}, "got no motion under any key"),
+        ({"betas": 0}, "got the keys betas, expected poses"),
     ],
 )
 def test_what_is_no_motion_on_this_skeleton_is_refused(tmp_path, keys, said):
     np.savez(tmp_path / "m.npz", **keys)
     with pytest.raises(InputError, match=said):
         converted(tmp_path / "m.npz", tmp_path, to="smplh")
+
+
+def test_coefficients_of_another_gender_are_another_body(smplh_models, fitted, tmp_path, monkeypatch):
+    (smplh_models / "SMPLH/SMPLH_MALE.npz").symlink_to(smplh_models / "SMPLH/SMPLH_FEMALE.npz")
+    try:
+        monkeypatch.setattr(back, "_found_params", lambda *_: {"betas": [0.25]})
+        converted(fitted, tmp_path, to="smplh", gender="male")
+    finally:
+        (smplh_models / "SMPLH/SMPLH_MALE.npz").unlink()
+    found = read_amass(tmp_path / "motion.npz")
+    assert (found.gender, found.betas.tolist()) == ("male", [0.25])
+
+
+def test_more_coefficients_than_the_model_has_are_refused(smplh_models, fitted, tmp_path):
+    with pytest.raises(
+        InputError, match=r"betas: got 4 coefficients, expected at most 3.*Leave the last ones"
+    ):
+        converted(fitted, tmp_path, to="smplh", betas=[0.0, 1.0, 2.0, 3.0])
+
+
+def test_doubts_of_the_way_back_stand_in_its_report(smplh_models, fitted, tmp_path):
+    found = converted(fitted, tmp_path, to="smplh", betas=[9.0], fps=0.04, up="-y")
+    (own, rate, betas) = found.report["warnings"]
+    assert "fps=0.04 is taken in place of the file's own, 60" in own
+    assert "pass fps=25" in rate
+    assert "betas=9 is far outside the range of smplh" in betas
+    assert read_amass(tmp_path / "motion.npz", up="-y").translation[:, 1].mean() < 0  # y down: up is negative

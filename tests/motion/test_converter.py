@@ -174,9 +174,12 @@ def test_a_world_with_another_axis_up_is_noticed(smplh_models, amass_file, tmp_p
     assert not caplog.text
     converted(amass_file, tmp_path / "y", up="y")
     said = (
-        "walk_poses.npz: the body stands along +z, but the world is taken to have +y up; if not so, pass up=z"
+        "walk_poses.npz: the body is lying on the whole, its head along z of the file; if that is not its "
+        "pose, pass up=z"
     )
     assert said in caplog.text
+    report = json.loads((tmp_path / "y/report.json").read_text())
+    assert report["warnings"] == [said]
 
 
 @pytest.mark.parametrize(
@@ -198,7 +201,9 @@ def test_layouts_are_told_apart_by_their_keys(tmp_path, keys, layout):
 
 def test_a_file_without_a_motion_is_refused(tmp_path):
     np.savez(tmp_path / "shape.npz", betas=np.zeros(16))
-    with pytest.raises(InputError, match=r"shape\.npz: got no motion under any key that is known"):
+    with pytest.raises(
+        InputError, match=r"shape\.npz: got the keys betas, expected poses, or .*pred_vertices"
+    ):
         converted(tmp_path / "shape.npz", tmp_path / "out")
 
 

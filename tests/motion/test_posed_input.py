@@ -8,7 +8,7 @@ import pytest
 from soma_core.errors import InputError
 from soma_core.io import VertexSequence
 from soma_core.layer import SomaLayer
-from soma_core.motion.posed_input import PosedInput
+from soma_core.motion.posed_input import PosedInput, world_axes
 from soma_core.rig import load_canonical
 
 LENGTH_TOLERANCE = 1e-6
@@ -148,3 +148,17 @@ def test_frames_that_are_no_body_do_not_decide(layer, mid):
     PosedInput(Stored(frames[:2], metres=1.0), layer, topology="canonical").check_size(
         layer, layer.identity({})
     )
+
+
+@pytest.mark.parametrize("factor", [10.0, 0.1, 12.0, 6.0])
+def test_a_size_that_no_unit_explains_is_refused(layer, mid, factor):
+    posed = PosedInput(Stored(factor * mid, metres=1.0), layer, topology="canonical")
+    with pytest.raises(InputError, match=r"times as large as its identity.*m, cm and mm do not fit"):
+        posed.check_size(layer, layer.identity({}))
+
+
+def test_a_world_that_says_the_other_side_up_is_turned(layer, mid):
+    for up in ("+y", "+z", "-y", "-z"):
+        stored = Stored(mid @ world_axes(up), metres=1.0, up=up)
+        posed = PosedInput(stored, layer, topology="canonical")
+        np.testing.assert_allclose(posed.read(0, 1)[0], mid[0][layer.mesh.mid_ids], atol=1e-5)
