@@ -115,7 +115,7 @@ def test_strict_lets_the_error_of_a_task_through(run: Run, monkeypatch: pytest.M
         ),
         ("bakend=soma", "bakend: got an unknown key, expected one of backend, backends, motion"),
         ("lod=big", "lod: got invalid value 'big', expected one of [mid, low, xlo]"),
-        ("write=[npz,uds]", "write[1]: got invalid value 'uds', expected one of [npz, usd, glb, png]"),
+        ("write=[npz,uds]", "write[1]: got invalid value 'uds', expected one of [npz, usd, glb, html, png,"),
         ("picture.width=wide", "picture.width: got value 'wide' of type 'str', expected Integer"),
         ("frames.start=[", "frames.start=[: got"),
         ("backend=soma,other", "got Ambiguous value for argument 'backend=soma,other'"),

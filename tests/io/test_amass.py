@@ -178,11 +178,19 @@ def test_rates_that_disagree_are_told(tmp_path, caplog, changes, fps, told):
     assert "m.npz: fps=24 is taken in place of the file's own" in caplog.text
 
 
-@pytest.mark.parametrize(("own", "told"), [("smplx_locked_head", True), ("smplh", True), ("smplx", False)])
+@pytest.mark.parametrize(
+    ("own", "told"),
+    [
+        ("smplx_locked_head", "with a locked head"),
+        ("smplh", "smplh has no joints for the face"),
+        ("smplx", ""),
+    ],
+)
 def test_betas_of_another_model_or_gender_are_told(tmp_path, caplog, own, told):
     file = written(tmp_path, smplx_file(surface_model_type=own))
     read_amass(file, gender="neutral")
-    assert (f"the betas belong to the model '{own}'" in caplog.text) == told
+    assert told in caplog.text
+    assert bool(caplog.text) == bool(told)
     assert "gender" not in caplog.text
     read_amass(file, gender="male")
-    assert "gender=male is taken in place of the file's own, neutral" in caplog.text
+    assert "gender=male is taken in place of neutral" in caplog.text

@@ -170,7 +170,7 @@ def test_coefficients_of_another_gender_are_another_body(smplh_models, fitted, t
     finally:
         (smplh_models / "SMPLH/SMPLH_MALE.npz").unlink()
     found = read_amass(tmp_path / "motion.npz")
-    assert (found.gender, found.betas.tolist()) == ("male", [0.25])
+    assert (found.gender, found.betas.tolist()) == ("male", [0.25] + 9 * [0.0])
 
 
 def test_more_coefficients_than_the_model_has_are_refused(smplh_models, fitted, tmp_path):

@@ -107,7 +107,8 @@ def test_keypoints_are_seen_from_the_world_of_the_motion(file, posed, tmp_path):
 
 def test_the_body_can_be_chosen_and_put_on_the_ground(file, tmp_path):
     pytest.importorskip("soma_backend_toy")
-    choice = {"write": ["vertices"], "translation": "ground", "backend": BackendChoice(name="toy")}
+    place = {"translation": "ground", "ground": "lowest"}
+    choice = {"write": ["vertices"], "backend": BackendChoice(name="toy"), **place}
     converted(file, tmp_path, **choice)
     with open_vertex_sequence(tmp_path / "vertices.npz") as sequence:
         assert abs(sequence.read(0, 3)[..., 1].min()) < 1e-5
