@@ -164,7 +164,7 @@ def read(
             "unit", got=repr(unit), expected=f"one of {', '.join(METRES)}", fix="Correct the name."
         )
     name = None if unit is None else str(unit)
-    return read_motion(path, fps=fps, unit=name, angles=angles, convention=convention)
+    return read_motion(path, fps=fps, unit=name, angles=angles, convention=convention, person=person)
 
 
 def write(motion: Motion, path: str | Path) -> None:

@@ -26,7 +26,14 @@ from soma_core.skeleton.identity import Identity
 from soma_core.view.picture import backend_colour, contact_sheet
 from soma_core.view.stage import Body
 
-__all__ = ["BodyProducts", "draw_contact_sheet", "write_body", "write_bvh_file", "write_motion_npz", "write_products"]
+__all__ = [
+    "BodyProducts",
+    "draw_contact_sheet",
+    "write_body",
+    "write_bvh_file",
+    "write_motion_npz",
+    "write_products",
+]
 
 
 class BodyProducts:
