@@ -358,7 +358,8 @@ def _plain() -> Iterator[tuple[str, bytes]]:
 def _all() -> dict[str, bytes | Callable[[], bytes]]:
     found: dict[str, bytes | Callable[[], bytes]] = {"npz bomb": _bomb, "pickle bomb of zlib": _zlib_bomb}
     parts = (
-        _plain, _pickles, _structured_pickles, _graphs, _arrays, _archives, _meshes, _scenes, _skeletons, made,
+        _plain, _pickles, _structured_pickles, _graphs, _arrays, _archives, _meshes, _scenes, _skeletons,
+        made,
     )  # fmt: skip
     for part in parts:
         found.update(part())
