@@ -1,4 +1,4 @@
-"""What a user can choose: closed sets of values, and the blocks of options that functions and commands share.
+"""The blocks of options that functions and commands share, and the closed sets of values in them.
 
 Commands compose these very classes by hydra; nothing here imports it.
 """
@@ -12,6 +12,36 @@ from os import PathLike
 from types import UnionType
 from typing import Any, get_args, get_origin, get_type_hints
 
+from soma_core.choices import (
+    AngleUnit,
+    Axes,
+    BetasFrom,
+    BodyGender,
+    BoneMatch,
+    BvhRest,
+    Carry,
+    Contacts,
+    ConvertResult,
+    Coordinates,
+    EulerOrder,
+    FitLod,
+    Gallery,
+    Gaps,
+    Ground,
+    IdentityMethod,
+    IdentitySource,
+    Kernels,
+    LengthUnit,
+    Lod,
+    Product,
+    RotationLayout,
+    RotationZero,
+    SmplLayout,
+    SmplModel,
+    Topology,
+    Translation,
+    Upward,
+)
 from soma_core.errors import InputError
 
 __all__ = [
@@ -55,209 +85,6 @@ __all__ = [
     "Translation",
     "Upward",
 ]
-
-
-class BetasFrom(StrEnum):
-    """How one body is made of shapes for each frame."""
-
-    mean = "mean"
-    median = "median"
-    first = "first"
-
-
-class BodyGender(StrEnum):
-    """Which of a user's SMPL models a motion is posed with."""
-
-    neutral = "neutral"
-    male = "male"
-    female = "female"
-
-
-class SmplLayout(StrEnum):
-    """Names of the keys that pose parameters of SMPL models are written under."""
-
-    amass = "amass"
-    smplx = "smplx"
-
-
-class Contacts(StrEnum):
-    """What becomes of feet in contact with the ground: they go with the legs, or stay where they stand."""
-
-    free = "free"
-    lock = "lock"
-
-
-class BoneMatch(StrEnum):
-    """Which bones of another skeleton are matched by direction; the others keep their turn since rest."""
-
-    bones = "bones"
-    limbs = "limbs"
-
-
-class Carry(StrEnum):
-    """How a motion of a model comes over: its body is fitted, or its joints are carried."""
-
-    fit = "fit"
-    skeleton = "skeleton"
-
-
-class ConvertResult(StrEnum):
-    """What the way back gives: pose parameters of the model, or vertices."""
-
-    poses = "poses"
-    vertices = "vertices"
-
-
-class Coordinates(StrEnum):
-    """Which of a file's motions of one person is taken."""
-
-    world = "world"
-    camera = "camera"
-
-
-class FitLod(StrEnum):
-    """Level of detail that poses are fitted on."""
-
-    mid = "mid"
-    low = "low"
-
-
-class Gallery(StrEnum):
-    """Which identities are animated."""
-
-    one = "one"
-    all = "all"
-
-
-class Ground(StrEnum):
-    """What lies on the floor: soles in contact, the lowest vertex of the clip, or nothing that is sought."""
-
-    contacts = "contacts"
-    lowest = "lowest"
-    none = "none"
-
-
-class Gaps(StrEnum):
-    """What becomes of frames that a file lacks."""
-
-    interpolate = "interpolate"
-    drop = "drop"
-
-
-class IdentityMethod(StrEnum):
-    """How the identity of a fit is found, if it is not known."""
-
-    known = "known"
-    backend = "backend"
-    unpose = "unpose"
-
-
-class IdentitySource(StrEnum):
-    """Which identity is animated."""
-
-    backend = "backend"
-    motion = "motion"
-
-
-class Kernels(StrEnum):
-    """Which version of the hot path runs."""
-
-    auto = "auto"
-    torch = "torch"
-    warp = "warp"
-
-
-class LengthUnit(StrEnum):
-    """Unit of a file's lengths."""
-
-    m = "m"
-    cm = "cm"
-    mm = "mm"
-
-
-class Lod(StrEnum):
-    """Level of detail of the canonical mesh."""
-
-    mid = "mid"
-    low = "low"
-    xlo = "xlo"
-
-
-class Product(StrEnum):
-    """A file that a run can write; ``soma_core.motion.writers`` has the table of them."""
-
-    npz = "npz"
-    usd = "usd"
-    glb = "glb"
-    html = "html"
-    png = "png"
-    bvh = "bvh"
-    joints = "joints"
-    csv = "csv"
-    keypoints = "keypoints"
-    vertices = "vertices"
-    obj = "obj"
-    ply = "ply"
-    pc2 = "pc2"
-    mdd = "mdd"
-    usdpoints = "usdpoints"
-
-
-class RotationLayout(StrEnum):
-    """Order of quaternions; whether 6D rotations are the first two rows or columns of a matrix."""
-
-    wxyz = "wxyz"
-    xyzw = "xyzw"
-    rows = "rows"
-    columns = "columns"
-
-
-class SmplModel(StrEnum):
-    """Models of the SMPL family."""
-
-    smpl = "smpl"
-    smplh = "smplh"
-    smplx = "smplx"
-
-
-class Topology(StrEnum):
-    """Which mesh vertices belong to."""
-
-    auto = "auto"
-    canonical = "canonical"
-    native = "native"
-
-
-class Translation(StrEnum):
-    """Where the body stands."""
-
-    ground = "ground"
-    motion = "motion"
-    none = "none"
-
-
-Upward = StrEnum("Upward", {"y": "y", "z": "z", "-y": "-y", "-z": "-z", "+y": "y", "+z": "z"})
-"""Upward axis of a file's world; ``+y`` is another name of ``y``."""
-
-
-class Axes(StrEnum):
-    """Axes of a file's world by name: a camera's have y down, and z forward, away from it."""
-
-    camera = "camera"
-
-
-class RotationZero(StrEnum):
-    """What the rotations of a file on this skeleton are relative to."""
-
-    t_pose_relative = "t_pose_relative"
-    absolute_local = "absolute_local"
-
-
-class AngleUnit(StrEnum):
-    """Unit of a file's rotation vectors."""
-
-    rad = "rad"
-    deg = "deg"
 
 
 class Options:
@@ -323,24 +150,6 @@ class BackendChoice(Options):
         for field_name in ("params", "options"):
             given = vars(self)[field_name].items()
             object.__setattr__(self, field_name, {name: value for name, value in given if value is not None})
-
-
-class BvhRest(StrEnum):
-    """The pose at which the angles of a BVH are zero."""
-
-    t_pose = "t_pose"
-    bind = "bind"
-
-
-class EulerOrder(StrEnum):
-    """Order of the rotation channels of a BVH; the first is applied last."""
-
-    XYZ = "XYZ"
-    XZY = "XZY"
-    YXZ = "YXZ"
-    YZX = "YZX"
-    ZXY = "ZXY"
-    ZYX = "ZYX"
 
 
 @dataclass(kw_only=True)

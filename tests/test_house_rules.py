@@ -39,6 +39,7 @@ RANKS = [
         "_lazy",
         "_version",
         "cache",
+        "choices",
         "errors",
         "files",
         "json_file",

@@ -153,13 +153,9 @@ def animate(
     if contacts == "lock" and held is not None:
         motion = lock_feet(motion, played.transforms, played.track, held, rig=layer.rig, floor=floor)
         played = _played(layer, identity, motion, wanted)
+    kept = {"rig_revision": layer.rig.revision, "skeleton": offsets}
     return Animated(
-        motion=replace(
-            motion,
-            rig_revision=layer.rig.revision,
-            skeleton=offsets,
-            identity=kept_identity(layer, identity),
-        ),
+        motion=replace(motion, identity=kept_identity(layer, identity), **kept),
         transforms=played.transforms,
         helpers=played.helpers,
         vertices={frame: played.vertices[frame] for frame in sorted(played.vertices)},
