@@ -10,11 +10,12 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from soma_core.errors import InputError
+from soma_core.io.data_files import DataFile
 from soma_core.io.joint_order import USER_JOINTS
 from soma_core.io.motion import Motion
 from soma_core.io.npz_fields import NpzFields, check_rotations
 
-__all__ = ["GEM_X_KEYS", "gem_x_motion", "gem_x_parts", "holds_gem_x"]
+__all__ = ["GEM_X_KEYS", "gem_x_motion", "gem_x_parts", "gem_x_result", "holds_gem_x"]
 
 GEM_X_KEYS = ("global_orient", "body_pose", "transl", "identity_coeffs", "scale_params")
 """Of one body: ``body_params_global`` of a result, in a world with +y up, holds them."""
@@ -29,6 +30,19 @@ def gem_x_parts(fields: NpzFields) -> dict[str, np.ndarray] | None:
         return None
     parts = {name: fields.raw(name) for name in GEM_X_KEYS if name in fields}
     return parts if holds_gem_x(parts) else None
+
+
+def gem_x_result(file: DataFile) -> dict[str, np.ndarray] | None:
+    """Arrays of the bodies in a result of GEM-X, in the world where it has that; None in other files."""
+    top = file.content if isinstance(file.content, dict) else {}
+    for node in (top.get("body_params_global"), top.get("body_params_incam"), top):
+        if not isinstance(node, dict) or not set(_MOVING) <= set(node):
+            continue
+        shapes = {name: file.shape(node[name]) for name in GEM_X_KEYS if name in node}
+        if all(shapes.values()):
+            parts = {name: file.array(node[name]) for name in shapes}
+            return parts if holds_gem_x(parts) else None
+    return None
 
 
 def holds_gem_x(parts: Mapping[str, np.ndarray]) -> bool:

@@ -13,7 +13,8 @@ from scipy.spatial.transform import Rotation
 
 from soma_core.cache import atomic_arrays
 from soma_core.errors import InputError
-from soma_core.io.gem_x import gem_x_motion, gem_x_parts
+from soma_core.io.data_files import DATA_SUFFIXES, open_data
+from soma_core.io.gem_x import gem_x_motion, gem_x_parts, gem_x_result
 from soma_core.io.joint_order import USER_JOINTS
 from soma_core.io.kimodo_npz import read_kimodo_npz
 from soma_core.io.motion import Convention, Motion
@@ -53,6 +54,11 @@ def read_motion(
         AssetError: the file is missing, damaged, a git-LFS pointer or no NPZ.
         InputError: the layout is unknown, or a key is missing or holds what a motion cannot have.
     """
+    if Path(path).suffix.lower() in DATA_SUFFIXES[1:]:
+        with open_data(path) as file:
+            parts = gem_x_result(file)
+            if parts is not None:
+                return gem_x_motion(parts, path=file.path, fps=fps, person=person)
     with open_npz(path) as fields:
         if "global_rot_mats" in fields or "local_rot_mats" in fields:
             return read_kimodo_npz(fields, fps=fps, unit=unit, person=person)

@@ -229,7 +229,9 @@ def _identity(fields: NpzFields) -> dict[str, object]:
     if "identity_params" in fields:
         found = {"backend": backend, "params": _parsed(fields, "identity_params"), **_rest(fields)}
         if "identity_options" in fields:
-            found["options"] = _parsed(fields, "identity_options")
+            given = _parsed(fields, "identity_options")
+            # Whether a model file is trusted, and so may run code, is no stranger's to say.
+            found["options"] = {name: value for name, value in given.items() if name != "trust"}
         return found
     found = {"backend": backend}
     for key in ("identity_coeffs", "scale_params"):

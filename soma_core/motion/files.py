@@ -10,7 +10,7 @@ from typing import Literal
 
 from soma_core.errors import InputError
 from soma_core.io.data_files import DATA_SUFFIXES, open_data
-from soma_core.io.gem_x import gem_x_parts
+from soma_core.io.gem_x import gem_x_parts, gem_x_result
 from soma_core.io.motion import Convention, Motion
 from soma_core.io.motion_files import read_motion, write_motion
 from soma_core.io.npz_fields import open_npz
@@ -91,6 +91,9 @@ def layout_of(path: str | Path) -> Layout | None:
     if suffix in SKELETON_SUFFIXES:
         return "skeleton"
     if suffix in DATA_SUFFIXES and suffix != ".npz":
+        with open_data(path) as file:
+            if gem_x_result(file) is not None:
+                return "soma"
         return smpl_layout(path)
     with open_npz(path) as fields:
         if "global_rot_mats" in fields or "local_rot_mats" in fields:

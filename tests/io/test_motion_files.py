@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from scipy.spatial.transform import Rotation
 
 from soma_core.errors import AssetError, InputError
@@ -586,3 +587,23 @@ def test_rig_revisions(motion):
     assert not check_rig(motion, "ffffffffffffffff")
     with pytest.raises(InputError, match=r"rig_revision: got 0123456789abcdef, expected ffffffffffffffff"):
         check_rig(replace(motion, convention="absolute_local"), "ffffffffffffffff")
+
+
+def test_a_file_does_not_say_what_is_trusted(tmp_path, motion):
+    """Trust of a model file lets it run code: whoever plays a motion says so himself."""
+    given = {"backend": "mhr", "params": {}, "options": {"trust": True, "lod": 6}}
+    write_motion(replace(motion, identity=given), tmp_path / "m.npz")
+    assert read_motion(tmp_path / "m.npz").identity["options"] == {"lod": 6}
+
+
+def test_a_result_of_gem_x_is_read_as_its_tool_writes_it(tmp_path):
+    """Tensors in a .pt, the world's and the camera's motion side by side."""
+    arrays, turns = gem_x_arrays()
+    world = {name: torch.as_tensor(value) for name, value in arrays.items()}
+    camera = {name: torch.zeros_like(value) for name, value in world.items()}
+    torch.save(
+        {"body_params_incam": camera, "body_params_global": world, "K": torch.eye(3)}, tmp_path / "r.pt"
+    )
+    assert layout_of(tmp_path / "r.pt") == "soma"
+    motion = read_motion(tmp_path / "r.pt", fps=30)
+    np.testing.assert_allclose(motion.rotations, turns.reshape(motion.rotations.shape), atol=1e-6)
