@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -10,11 +9,10 @@ from typing import Any
 import numpy as np
 
 from soma_core.errors import AssetError, InputError
-from soma_core.files import refuse_unreadable
+from soma_core.json_file import read_json
 
 __all__ = ["Camera", "read_camera"]
 
-_MOST_BYTES = 64 * 2**20
 _NEEDED, _SIZE = ("fx", "fy", "cx", "cy", "extrinsics"), ("width", "height")
 _EXAMPLE = '{"fx": 1000, "fy": 1000, "cx": 640, "cy": 360, "extrinsics": [[1,0,0,0],[0,-1,0,1],[0,0,-1,3]]}'
 
@@ -69,11 +67,7 @@ def read_camera(path: str | Path) -> Camera:
         InputError: a key is missing or strange, or holds what a camera cannot have.
     """
     path = Path(path).expanduser()
-    refuse_unreadable(path, fix=f"Write a camera such as {_EXAMPLE}", most_bytes=_MOST_BYTES)
-    try:
-        values = json.loads(path.read_text(encoding="utf-8"))
-    except (ValueError, RecursionError) as error:
-        raise AssetError(path, cause=f"no JSON ({error})", fix=f"Write {_EXAMPLE}") from error
+    values = read_json(path, fix=f"Write a camera such as {_EXAMPLE}")
     if not isinstance(values, dict):
         raise AssetError(path, cause="no JSON object", fix=f"Write {_EXAMPLE}")
     missing = [key for key in _NEEDED if key not in values]

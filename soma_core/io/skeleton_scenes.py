@@ -14,6 +14,7 @@ from soma_core.io.glb_animation import NodeTracks
 from soma_core.io.glb_file import GlbFile
 from soma_core.io.joint_order import USER_JOINTS
 from soma_core.io.skeleton_motion import SkeletonMotion, skeleton_of_worlds
+from soma_core.usd_stage import open_stage, usd_errors
 
 __all__ = ["read_glb_skeleton", "read_usd_skeleton"]
 
@@ -192,19 +193,17 @@ def read_usd_skeleton(path: Path, *, fps: float | None = None, root: str | None 
     """Read the joints of a UsdSkel skeleton: its animation, or its rest pose as one frame.
 
     Raises:
-        AssetError: no USD file, or without a skeleton.
+        AssetError: no USD file, one that refers to what may not be opened, or without a skeleton.
         InputError: several skeletons.
     """
-    try:
-        return _usd(path, fps, root)
-    except RuntimeError as error:  # Tf.ErrorException of pxr
-        raise AssetError(path, cause="not a readable USD file", fix="Export it again.") from error
+    stage = open_stage(path, fix="Export it again.")
+    with usd_errors(path, fix="Export it again."):
+        return _usd(stage, path, fps, root)
 
 
-def _usd(path: Path, fps: float | None, root: str | None) -> SkeletonMotion:
+def _usd(stage: Any, path: Path, fps: float | None, root: str | None) -> SkeletonMotion:
     from pxr import Usd, UsdGeom, UsdSkel
 
-    stage = Usd.Stage.Open(str(path))
     found = [prim for prim in stage.Traverse() if prim.IsA(UsdSkel.Skeleton)]
     found = [prim for prim in found if root in (None, prim.GetName(), str(prim.GetPath()))] if root else found
     if len(found) != 1:
