@@ -40,7 +40,7 @@ def read_obj(path: Path | str) -> tuple[np.ndarray, np.ndarray]:
                 faces.extend(_fan(fields, len(points) // 3))
         except (ValueError, OverflowError) as error:
             raise AssetError(
-                path, cause=f"line {number} is {line:.60}", fix="Export the mesh again."
+                path, cause=f"line {number} is {line.rstrip():.60}", fix="Export the mesh again."
             ) from error
     if not points or not faces:
         raise AssetError(path, cause="holds no mesh", fix="Export it again with vertices and faces.")

@@ -17,6 +17,9 @@ RotationLayout = Literal["wxyz", "xyzw", "rows", "columns"]
 WIDTHS = (3, 4, 6, 9)
 """Numbers of one rotation: a vector, a quaternion, two rows or columns, a matrix."""
 
+_LARGEST = 1e6
+"""Angle [rad] that no file means, degrees neither."""
+
 _ROTATION_TOLERANCE = 0.02
 """Largest entry of |RᵀR - I| accepted of matrices, and departure of a norm from 1: estimators store half
 precision and means of rotations; a scaled matrix does not pass."""
@@ -52,6 +55,8 @@ def axis_angles(values: np.ndarray, width: int, layout: RotationLayout | None) -
         ValueError: no rotations, or a layout that cannot be told; the text says which.
     """
     if width == 3:
+        if np.nanmax(np.abs(values), initial=0) > _LARGEST:
+            raise ValueError(f"angles of up to {np.nanmax(np.abs(values)):.3g} rad")
         return values, "axis-angle"
     flat = values.reshape(-1, width)
     whole = np.isfinite(flat).all(axis=1)
