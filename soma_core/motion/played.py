@@ -180,7 +180,11 @@ class MovingBodies:
             InputError: none was chosen, and the file keeps none.
         """
         chosen, stored = self._chosen, motion.identity
-        if chosen is not None:
+        own = chosen is not None and chosen.name == stored.get("backend") and "params" in stored
+        if chosen is not None and own and chosen.options and not chosen.params:
+            # How the file's own backend is opened, as whether its model is trusted; the body stays.
+            stored = {**stored, "options": {**dict(stored.get("options", {})), **chosen.options}}
+        elif chosen is not None:
             stored = {"backend": chosen.name, "params": chosen.params, "options": chosen.options}
         elif "params" not in stored and "rest" not in stored:
             raise InputError(

@@ -87,7 +87,8 @@ def test_a_motion_becomes_parameters_as_sam3d_names_them(tools, tmp_path):
     write(
         replace(clip, identity={"backend": "mhr_lod6", "params": known, "options": TRUST}), tmp_path / "m.npz"
     )
-    options = ConvertOptions(to="mhr_lod6", result="poses", lod="low")
+    trusted = BackendChoice(name="mhr_lod6", options=TRUST)
+    options = ConvertOptions(to="mhr_lod6", result="poses", lod="low", backend=trusted)
     report = convert_file(tmp_path / "m.npz", tmp_path / "out", options=options).report
     with np.load(tmp_path / "out/motion.npz", allow_pickle=False) as file:
         shapes = {name: file[name].shape for name in file.files}
