@@ -14,8 +14,10 @@ from soma_core import load_canonical
 from soma_core.errors import InputError
 from soma_core.io.bvh import write_bvh
 from soma_core.io.joint_order import PARENT_NAMES, USER_JOINTS
+from soma_core.io.skeleton_files import read_skeleton
 from soma_core.io.skeleton_motion import soma_skeleton
-from soma_core.motion import ConvertOptions, convert_file
+from soma_core.layer import SomaLayer
+from soma_core.motion import ConvertOptions, FrameRange, convert_file, load_clip, write_body
 from soma_core.motion.retarget import retarget
 from tests.skeletons import along_axes, biped, in_another_pose, moved
 
@@ -281,3 +283,14 @@ def test_settings_of_skeletons_are_refused_elsewhere(option, value, tmp_path):
     np.savez(tmp_path / "a.npz", local_rot_mats=turns, root_positions=np.zeros((2, 3)))
     with pytest.raises(InputError, match=f"{option}: got {value}"):
         convert_file(tmp_path / "a.npz", tmp_path / "out", options=ConvertOptions(**{option: value}))
+
+
+@pytest.mark.parametrize("name", ["body.glb", "body.usdc"])
+def test_skinned_files_of_this_project_come_back_by_their_joints(name, tmp_path):
+    """Rotations to 1e-5; float32 in the files leaves 1e-7."""
+    layer = SomaLayer("soma", lod="low")
+    motion = load_clip(frames=FrameRange(start=30, stop=210, step=60))
+    write_body(tmp_path / name, layer, layer.identity(), motion)
+    found = retarget(read_skeleton(tmp_path / name)).motion
+    np.testing.assert_allclose(found.rotations, motion.rotations, atol=1e-5)
+    np.testing.assert_allclose(found.translation, motion.translation, atol=1e-5)
