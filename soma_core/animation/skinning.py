@@ -1,4 +1,4 @@
-"""Linear blend skinning with every influence kept (paper, equation 6)."""
+"""Linear blend skinning with every influence kept (paper, section 3.5, equation 6)."""
 
 from __future__ import annotations
 

@@ -28,7 +28,7 @@ _RESTORE = f"{RESTORE}; a model of your own is taken by correctives=FILE"
 
 
 class Correctives(torch.nn.Module):
-    """Displacements of the rest shape that depend on the pose: ``tanh(relu(f W1)) W2``.
+    """Displacements of the rest shape that depend on the pose: ``tanh(relu(f W1)) W2`` (paper, equation 7).
 
     Exactly zero in the bind pose. Both stages are sparse products whose weights already hold the masks;
     what no vertex of this level of detail needs is left out.

@@ -1,4 +1,4 @@
-"""Barycentric coordinates in the tetrahedron raised on a triangle (paper, section 3.3, equation 1).
+"""Barycentric coordinates in the tetrahedron raised on a triangle (paper, section 3.3).
 
 The fourth corner is ``p0 + l n`` with the unit normal n and the mean edge length l. The paper raises it
 by the raw cross product, which grows with the *square* of size; with a length the coordinates do not

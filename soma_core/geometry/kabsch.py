@@ -132,7 +132,7 @@ def rotation_from_covariance(covariance: Tensor, *, reference: Tensor | None = N
     A weak pull towards `reference` (identity by default), proportional to ``|H|``, decides clouds of
     rank one or zero: H = 0 returns the reference. Where even so no maximiser stands out, a rotation is
     still returned. Differentiable; the derivative is exact wherever the maximiser is unique. Paper,
-    equation 5, in place of its SVD and equation 8.
+    equation 5, in place of its SVD and of the iteration of equation 8.
     """
     if reference is None:
         reference = torch.eye(3, dtype=covariance.dtype, device=covariance.device)

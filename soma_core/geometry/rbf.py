@@ -15,9 +15,9 @@ _RANK_TOLERANCE = 1e-6
 def affine_rbf_weights(points: np.ndarray, queries: np.ndarray) -> np.ndarray:
     """Weights w (q, n) with ``w @ points == queries``, exact under every affine map of the points.
 
-    Linear kernel ``|a - b|`` with a first-degree polynomial; the weights of each query sum to one. One
-    factorisation serves all queries. Clouds of fewer than four points or of lower rank get the
-    least-squares solution of minimum norm; coincident points share a weight equally.
+    Paper, equation 2: a linear kernel ``|a - b|``, here with a first-degree polynomial; the weights of each
+    query sum to one. One factorisation serves all queries. Clouds of fewer than four points or of lower rank
+    get the least-squares solution of minimum norm; coincident points share a weight equally.
 
     Args:
         points: (n, 3) float64, n >= 1.

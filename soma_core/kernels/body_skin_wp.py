@@ -1,4 +1,4 @@
-"""Bodies skinned in one pass, without gradients; bodies in SIMD lanes (paper, equations 5 and 6).
+"""Bodies skinned in one pass, without gradients; bodies in SIMD lanes.
 
 Tile by tile of vertices: rest points, brought to the bind pose where asked for, what the correctives add, and
 skinning. Nothing but posed vertices is written. The twin of ``animation.skinning`` for a CPU.

@@ -1,4 +1,4 @@
-"""Linear blend skinning in Warp (paper, equation 6): the twin of ``animation.skinning``."""
+"""Linear blend skinning in Warp: the twin of ``animation.skinning``."""
 
 import functools
 from types import SimpleNamespace

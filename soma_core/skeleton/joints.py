@@ -64,7 +64,7 @@ def joint_regressor(mesh: CanonicalMesh, rig: Rig) -> scipy.sparse.csr_array:
     """Matrix W (J, v) with ``joints = W @ vertices``; exact at the bind shape and all its affine images.
 
     Rows sum to one except the root's, which is empty: the root is pinned to the origin. Cached on disk
-    by rig revision. Paper, equations 2 to 4, with the weights fixed at the bind shape.
+    by rig revision. Paper, equation 3 for each joint, and equation 4 for all of them.
     """
     weights = (rig.weights.data, rig.weights.indices, rig.weights.indptr)
     key = content_key(

@@ -1,7 +1,7 @@
 """Vertices of one level of detail on the surface of another: how bodies reach the extra-low mesh.
 
 The extra-low vertices are none of the low ones, so they are carried by the same operator as a native
-topology (paper, section 3.3, equation 1): barycentric coordinates on the nearest face, and a height.
+topology (paper, section 3.3): barycentric coordinates on the nearest face, and a height.
 """
 
 from __future__ import annotations
