@@ -14,6 +14,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+from soma_core.apart import limit_process
+
 __all__: list[str] = []
 
 _MOST_LAYERS, _MOST_PRIMS = 1000, 200_000
@@ -22,16 +24,6 @@ _TOUCHING_S = 1.0
 
 class _RefusedError(Exception):
     """Why the file is not opened."""
-
-
-def _limit(seconds: int, size: int) -> None:
-    try:
-        import resource
-    except ImportError:  # Windows knows no such limits; the time on the clock is limited all the same
-        return
-    resource.setrlimit(resource.RLIMIT_DATA, (size, size))
-    resource.setrlimit(resource.RLIMIT_CPU, (seconds, seconds + 1))
-    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
 
 
 def _layers(path: Path, *, anywhere: bool) -> None:
@@ -124,8 +116,8 @@ def _probe(path: Path, *, anywhere: bool) -> str | None:
 
 
 if __name__ == "__main__":
-    _path, _seconds, _size, _anywhere = sys.argv[1:]
-    _limit(int(_seconds), int(_size))
+    _path, _anywhere, _seconds, _size = sys.argv[1:]
+    limit_process(int(_seconds), int(_size))
     sys.stdout.write("\n" + json.dumps({"refused": _probe(Path(_path), anywhere=_anywhere == "True")}) + "\n")
     sys.stdout.flush()
     os._exit(0)  # what a damaged file left behind may not survive an orderly end

@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import os
 import re
-import subprocess
-import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -13,6 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from soma_core.apart import read_apart
 from soma_core.errors import AssetError, SomaError
 from soma_core.files import refuse_unreadable
 from soma_core.json_file import parse_json
@@ -101,17 +99,11 @@ def _is_plain(path: Path, head: bytes) -> bool:
 def _try_apart(path: Path, fix: str, *, allow_references: bool) -> None:
     """Open the file in a process with limits; refuse what it refuses, and what ends it."""
     size = path.stat().st_size
-    seconds = _SECONDS + size // _BYTES_A_SECOND
-    limits = [str(seconds), str(_MEMORY + _EXPANSION * size), str(allow_references)]
-    environment = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path), "PXR_WORK_THREAD_LIMIT": "1"}
+    seconds, memory = _SECONDS + size // _BYTES_A_SECOND, _MEMORY + _EXPANSION * size
+    told = read_apart("soma_core.usd_probe", path, allow_references, seconds=seconds, memory=memory)
     try:
-        ended = subprocess.run(  # noqa: S603 - our own interpreter and module
-            [sys.executable, "-m", "soma_core.usd_probe", str(path.resolve()), *limits],
-            stdin=subprocess.DEVNULL, capture_output=True, timeout=20 + 3 * seconds, env=environment,
-            check=False,
-        )  # fmt: skip
-        cause = parse_json(ended.stdout.rstrip().rpartition(b"\n")[2])["refused"]
-    except (subprocess.TimeoutExpired, ValueError, TypeError, KeyError):
+        cause = parse_json((told or b"").rstrip().rpartition(b"\n")[2])["refused"]
+    except (ValueError, TypeError, KeyError):
         cause = "USD ends, or takes more time or memory than a file of its size can mean"
     if cause is None:
         return

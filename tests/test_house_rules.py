@@ -40,9 +40,11 @@ RANKS = [
     {
         "_lazy",
         "_version",
+        "apart",
         "cache",
         "choices",
         "errors",
+        "fbx_probe",
         "files",
         "json_file",
         "npz",

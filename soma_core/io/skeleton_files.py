@@ -1,4 +1,4 @@
-"""Open the skeleton of a file over time, whatever its format: BVH, GLB, VRM or USD."""
+"""Open the skeleton of a file over time, whatever its format: BVH, FBX, GLB, VRM or USD."""
 
 from __future__ import annotations
 
@@ -8,20 +8,15 @@ from pathlib import Path
 from soma_core.errors import InputError
 from soma_core.files import refuse_unreadable
 from soma_core.io.bvh_file import read_bvh
+from soma_core.io.fbx import read_fbx
 from soma_core.io.skeleton_motion import SkeletonMotion
 from soma_core.io.skeleton_scenes import read_glb_skeleton, read_usd_skeleton
 
 __all__ = ["SKELETON_SUFFIXES", "read_skeleton"]
 
 
-def _read_fbx(path: Path, **_: object) -> SkeletonMotion:
-    """Refuse FBX: ufbx 0.0.5, the one library for it, crashes the process on files that Blender writes."""
-    raise InputError(str(path), got="an FBX file", expected="BVH, GLB or USD",
-                     fix="Open it in Blender and export it as glTF (.glb), or as BVH.")  # fmt: skip
-
-
 _READERS: dict[str, Callable[..., SkeletonMotion]] = {
-    ".bvh": read_bvh, ".fbx": _read_fbx, ".glb": read_glb_skeleton, ".vrm": read_glb_skeleton,
+    ".bvh": read_bvh, ".fbx": read_fbx, ".glb": read_glb_skeleton, ".vrm": read_glb_skeleton,
     **dict.fromkeys((".usd", ".usda", ".usdc", ".usdz"), read_usd_skeleton),
 }  # fmt: skip
 
@@ -33,7 +28,7 @@ def read_skeleton(path: str | Path, *, fps: float | None = None, root: str | Non
     """Read the joints of a file over time; lengths and axes are as the file has them.
 
     Args:
-        path: ``.bvh``, ``.glb``, ``.vrm`` or ``.usd``. Nothing in it is executed.
+        path: ``.bvh``, ``.fbx``, ``.glb``, ``.vrm`` or ``.usd``. Nothing in it is executed.
         fps: frame rate; overrides that of a BVH, and is what the others are sampled at.
         root: name of the skeleton or its root joint, where a file has several.
 

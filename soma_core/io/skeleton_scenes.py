@@ -3,22 +3,22 @@
 from __future__ import annotations
 
 import struct
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from soma_core.errors import AssetError, InputError
+from soma_core.errors import AssetError, InputError, SomaError
 from soma_core.io.glb_animation import NodeTracks
 from soma_core.io.glb_file import GlbFile
 from soma_core.io.joint_order import USER_JOINTS
 from soma_core.io.skeleton_motion import SkeletonMotion, skeleton_of_worlds
 from soma_core.usd_stage import open_stage, usd_errors
 
-__all__ = ["read_glb_skeleton", "read_usd_skeleton"]
+__all__ = ["DAMAGE", "among", "by_depth", "joints_under", "read_glb_skeleton", "read_usd_skeleton"]
 
-_DAMAGE = (KeyError, IndexError, TypeError, ValueError, AttributeError, RecursionError, struct.error)
+DAMAGE = (KeyError, IndexError, TypeError, ValueError, AttributeError, RecursionError, struct.error)
 _FPS = 30.0
 _MOST = 50_000_000
 """Joints times frames that are read at most: 4 GB of rotations."""
@@ -38,7 +38,9 @@ def read_glb_skeleton(path: Path, *, fps: float | None = None, root: str | None 
     """
     try:
         return _glb(path, fps, root)
-    except _DAMAGE as error:
+    except SomaError:
+        raise
+    except DAMAGE as error:
         cause = f"no usable GLB ({error.__class__.__name__}: {error})"
         raise AssetError(
             path, cause=cause, fix="Export one skeleton with one animation, uncompressed."
@@ -61,8 +63,7 @@ def _glb(path: Path, fps: float | None, root: str | None) -> SkeletonMotion:
         joints = set(range(len(nodes)))
     if not joints:
         raise ValueError("it holds no skin and no node that turns: no joints")
-    joints = _under(path, joints, parents, names, root)
-    order = sorted(joints, key=lambda joint: (_depth(parents, joint), joint))
+    order = by_depth(joints_under(path, joints, parents, names, root), parents)
     times, rate = _times(tracks.times, fps)
     _check_size(path, len(times) * len(order))
     worlds = np.concatenate(list(_glb_worlds(tracks, times, order, len(nodes))))
@@ -71,7 +72,7 @@ def _glb(path: Path, fps: float | None, root: str | None) -> SkeletonMotion:
         rest = _bound(file, skins, rest)
     return skeleton_of_worlds(
         [names[joint] for joint in order],
-        _among(order, parents),
+        among(order, parents),
         rest[order],
         worlds,
         fps=rate,
@@ -91,7 +92,7 @@ def _humanoid(extensions: dict[str, Any]) -> Iterator[tuple[int, str]]:
         yield int(bone["node"]), name.removesuffix(thumb) + renamed.get(thumb, "")
 
 
-def _under(
+def joints_under(
     path: Path, joints: set[int], parents: np.ndarray, names: Sequence[str], root: str | None
 ) -> set[int]:
     """Joints and what lies between them, below one node."""
@@ -125,7 +126,13 @@ def _depth(parents: np.ndarray, joint: int) -> int:
     return sum(1 for _ in _upwards(parents, joint))
 
 
-def _among(order: Sequence[int], parents: np.ndarray) -> np.ndarray:
+def by_depth(joints: Iterable[int], parents: np.ndarray) -> list[int]:
+    """Joints with parents before children."""
+    return sorted(joints, key=lambda joint: (_depth(parents, joint), joint))
+
+
+def among(order: Sequence[int], parents: np.ndarray) -> np.ndarray:
+    """Parents by their place in `order`, -1 for what is not in it."""
     place = {joint: index for index, joint in enumerate(order)}
     return np.array([place.get(int(parents[joint]), -1) for joint in order])
 

@@ -26,7 +26,7 @@ _watched: list[str] = []
 
 
 def _audit(event: str, arguments: tuple) -> None:
-    ours = event == "subprocess.Popen" and "soma_core.usd_probe" in arguments[1]
+    ours = event == "subprocess.Popen" and {"soma_core.usd_probe", "soma_core.fbx_probe"} & {*arguments[1]}
     if event in _EVENTS or (event == "subprocess.Popen" and not ours):
         _watched.append(event)
 

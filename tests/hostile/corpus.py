@@ -337,6 +337,31 @@ def _skeletons() -> Iterator[tuple[str, bytes]]:
     yield "bvh of no frame time", good.replace(b"0.04", b"0") + b"0"
 
 
+def _fbx() -> Iterator[tuple[str, bytes]]:
+    """Text of FBX, and headers of binary files that lie."""
+    head = b"; FBX 7.4.0 project file\nFBXHeaderExtension: {\n FBXVersion: 7400\n}\n"
+    bone = b'Model: %d, "Model::Hips%d", "LimbNode" {\n}\n'
+    binary = b"Kaydara FBX Binary  \x00\x1a\x00" + struct.pack("<I", 7400)
+    yield "fbx of no bones", head + b"Objects: {\n}\nConnections: {\n}\n"
+    yield "fbx of a million brackets", head + b"A: {\n" * 1_000_000
+    yield "fbx of a missing bracket", head + b"Objects: {\n" + bone % (1, 1)
+    yield (
+        "fbx of a circle",
+        head + b"Objects: {\n" + bone % (1, 1) + bone % (2, 2)
+        + b'}\nConnections: {\nC: "OO",1,2\nC: "OO",2,1\n}\n',
+    )  # fmt: skip
+    objects = head + b"Objects: {\n" + b"".join(bone % (number, number) for number in range(1, 120_000))
+    yield "fbx of very many bones", objects + b"}\n"
+    yield "fbx of a huge array", head + b"Objects: {\nA: *9000000000000 {\n a: 1,2\n}\n}\n"
+    yield "fbx binary cut off", binary + struct.pack("<IIIB", 2**31, 3, 12, 4) + b"Objects"[:4]
+    yield "fbx binary of a huge property", binary + struct.pack("<IIIB", 100, 1, 50, 1) + b"AS" + b"\xff" * 40
+    packed = zlib.compress(bytes(64 * 2**20), 9)
+    record = b"d" + struct.pack("<III", 2**29, 1, len(packed)) + packed
+    node = struct.pack("<IIIB", 27 + 13 + 1 + len(record), 1, len(record), 1) + b"A" + record
+    yield "fbx binary of a bomb", binary + node + bytes(13)
+    yield "fbx of a version that is none", head.replace(b"7400", b"99999999999999999999")
+
+
 def _plain() -> Iterator[tuple[str, bytes]]:
     yield "empty file", b""
     yield (
@@ -359,7 +384,7 @@ def _all() -> dict[str, bytes | Callable[[], bytes]]:
     found: dict[str, bytes | Callable[[], bytes]] = {"npz bomb": _bomb, "pickle bomb of zlib": _zlib_bomb}
     parts = (
         _plain, _pickles, _structured_pickles, _graphs, _arrays, _archives, _meshes, _scenes, _skeletons,
-        made,
+        _fbx, made,
     )  # fmt: skip
     for part in parts:
         found.update(part())

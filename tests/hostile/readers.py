@@ -30,8 +30,10 @@ from soma_core.rig.neutral import load_shape_space, read_topology
 from soma_core.rig.procedural_json import read_procedural
 from soma_core.rig.usd import read_usd_rig
 from soma_core.tasks.wrap import read_landmarks
+from tests.fbx_files import write_fbx
 from tests.io.smpl_layouts import TURNS as SMPLX_TURNS
 from tests.io.smpl_layouts import save_joblib, save_npy, save_npz, save_pt, smplx_names, wham
+from tests.skeletons import moved
 from tests.standins.pickles import ch, csc, select, write_pickle
 
 __all__ = ["READERS", "Reader"]
@@ -44,7 +46,7 @@ class Reader:
     """A reader, the suffix of its files, and how to write one that it reads; None: too large to mutate.
 
     `accepts` names the files that are sound for this reader, which does not read what is wrong with them.
-    NaN marks a vertex that is missing in a sequence.
+    `apart` readers start a process for every file. NaN marks a vertex that is missing in a sequence.
     """
 
     name: str
@@ -52,6 +54,7 @@ class Reader:
     read: Callable[[Path], Any]
     good: Callable[[Path], Any] | None = None
     accepts: tuple[str, ...] = ()
+    apart: bool = False
 
 
 def _frames(path: Path) -> np.ndarray:
@@ -229,6 +232,12 @@ def _bvh(path: Path) -> None:
     path.write_text(f"{head}{leg}\n }}\n}}\nMOTION\nFrames: 2\nFrame Time: 0.04\n" + "0 90 0 1 2 3 4\n" * 2)
 
 
+def _fbx(path: Path) -> None:
+    parents, rest = np.array([-1, 0]), np.array([[0, 1.0, 0], [0, 0.5, 0]])
+    motion = moved(("Hips", "LeftLeg"), parents, rest, frames=2)
+    write_fbx(motion, path)
+
+
 def _json(path: Path) -> None:
     path.write_text(json.dumps({"schema": 1, "rig_hash": "a", "rig_revision": "b", "files": {}}))
 
@@ -316,6 +325,15 @@ READERS = [
         good=_bvh,
         accepts=("bvh of a billion frames", "bvh of a joint without a root"),
     ),
+    Reader(
+        name="fbx",
+        suffix=".fbx",
+        read=read_skeleton,
+        good=_fbx,
+        accepts=("fbx of a missing bracket",),
+        apart=True,
+    ),
+    Reader(name="joints of a vrm", suffix=".vrm", read=read_skeleton, good=_joints_glb),
     Reader(name="joints of a glb", suffix=".glb", read=read_skeleton, good=_joints_glb),
     Reader(
         name="joints of a usd",

@@ -10,7 +10,15 @@ from tests.hostile.corpus import FILES, LINKS
 from tests.hostile.readers import READERS
 
 each_reader = pytest.mark.parametrize("reader", READERS, ids=lambda reader: reader.name)
-KINDS = {".npy": "array", ".usdz": "npz", ".pkl": "pickle", ".pca": "point.pca", ".json": "JSON", ".pt": "pt"}
+KINDS = {
+    ".npy": "array",
+    ".vrm": "glb",
+    ".usdz": "npz",
+    ".pkl": "pickle",
+    ".pca": "point.pca",
+    ".json": "JSON",
+    ".pt": "pt",
+}
 """Suffix -> first word of the names of hostile files of that format, where it is not the suffix."""
 
 FOR_ALL = (
@@ -23,7 +31,7 @@ FOR_ALL = (
 
 def files_for(reader):
     """Hostile files of the reader's own format, those of no format, and some of others."""
-    kinds = {*KINDS.values(), "npz", "obj", "ply", "glb", "usda", "usdc", "bvh"} - {
+    kinds = {*KINDS.values(), "npz", "obj", "ply", "glb", "usda", "usdc", "bvh", "fbx"} - {
         KINDS.get(reader.suffix, reader.suffix[1:])
     }
     return [name for name in FILES if name in FOR_ALL or name.partition(" ")[0] not in kinds]
