@@ -1,7 +1,7 @@
 """Evaluate the nodes of an FBX file in this process, which has limits and may die: run by `fbx`.
 
-ufbx 0.0.5 frees what it gave of a scene when nobody holds it, and gives it again when it is asked a second time: the
-process dies. Everything is asked for once here and held to the end.
+ufbx 0.0.5 frees what it gave of a scene when nobody holds it, and gives it again when it is asked a second
+time: the process dies. Everything is asked for once here and held to the end.
 """
 
 from __future__ import annotations
@@ -83,11 +83,9 @@ class _Scene:
         chosen = max(range(len(stacks)), key=lambda index: spans[index], default=None)
         begin, span = (0.0, 0.0) if chosen is None else (float(stacks[chosen].time_begin), spans[chosen])
         if span <= 0:  # some programs leave out how long it is
-            keys = [(curve.min_time, curve.max_time) for curve in self.each(self.native.anim_curves)]
-            begin, end = (
-                (min(first for first, _ in keys), max(last for _, last in keys)) if keys else (0.0, 0.0)
-            )
-            span = end - begin
+            curves = self.each(self.native.anim_curves)
+            begin = min((float(curve.min_time) for curve in curves), default=0.0)
+            span = max((float(curve.max_time) for curve in curves), default=0.0) - begin
         frames = span * rate + 1
         if not 0 < frames * len(joints) <= _MOST:
             raise _RefusedError(f"{frames:.3g} frames of {len(joints)} nodes are more than {_MOST} places")

@@ -18,9 +18,10 @@ _TYPE = {"T": "Lcl Translation", "R": "Lcl Rotation"}
 
 
 def write_fbx(motion: SkeletonMotion, path: Path, *, skin: bool = False, told: bool = True) -> None:
-    """Write a motion as ASCII FBX 7.4, in centimetres, keys at each frame; turned at rest where there is a skin.
+    """Write a motion as ASCII FBX 7.4, in centimetres, keys at each frame.
 
-    Some programs leave out where the animation starts: `told` false.
+    With a skin, bones stand in another pose than that of rest. Some programs leave out where the animation
+    starts: `told` false.
     """
     objects, links, curves = [], [], []
     bones = motion.rest.copy()
@@ -77,7 +78,7 @@ NodeAttribute: {_model(joint) + 1}, "NodeAttribute::{name}", "LimbNode" {{
 }}""")
             links.append(f'"OP",{node + 1 + axis},{node}, "d|{"XYZ"[axis]}"')
     start = 'P: "LocalStart", "KTime", "Time", "",0' if told else ""
-    span = f'{start}\n    P: "LocalStop", "KTime", "Time", "",{round((motion.frame_count - 1) * _TICKS / motion.fps)}'
+    span = f'{start}\n    P: "LocalStop", "KTime", "Time", "",{times.rpartition(",")[2]}'
     objects += [
         f'AnimationStack: 400000, "AnimStack::Take 001", "" {{\n  Properties70: {{\n    {span}\n  }}\n}}',
         'AnimationLayer: 400001, "AnimLayer::BaseLayer", "" {\n}',
