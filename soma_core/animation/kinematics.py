@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import functools
+
 import numpy as np
 import torch
 from torch import Tensor
 
+from soma_core.geometry.constants import constant
 from soma_core.geometry.torch_func import transformed
 from soma_core.geometry.tree import descendants, joint_levels
 from soma_core.rig.skeleton import Rig
@@ -63,26 +66,22 @@ class Kinematics(torch.nn.Module):
         where = np.argsort(order)
         self.level_sizes = [len(level) for level in levels]
 
-        def keep(name: str, array: np.ndarray) -> None:
-            tensor = torch.as_tensor(np.array(array), device=device)
-            tensor = tensor.to(dtype if tensor.is_floating_point() else torch.int64)
-            self.register_buffer(name, tensor, persistent=False)
-
-        keep("parents", parents[1:])
-        keep("tree", rig.parents)
-        keep("order", order)
-        keep("restore", where)
-        keep("orient", orient)
-        keep("parent_orient", orient[parents])
-        keep("bind_relative", bind_relative[1:])
+        keep = functools.partial(constant, device=device, dtype=dtype)
+        self.parents = keep(parents[1:])
+        self.tree = keep(rig.parents)
+        self.order = keep(order)
+        self.restore = keep(where)
+        self.orient = keep(orient)
+        self.parent_orient = keep(orient[parents])
+        self.bind_relative = keep(bind_relative[1:])
         bind_turn = bind @ orient.transpose(0, 2, 1)  # accumulated turns of the bind pose
-        keep("bind_rotation", bind)
-        keep("bind_parent_turn", bind_turn[parents])
-        keep("ancestors", descendants(rig.parents).T.astype(float))  # sums from the root down to each joint
+        self.bind_rotation = keep(bind)
+        self.bind_parent_turn = keep(bind_turn[parents])
+        self.ancestors = keep(descendants(rig.parents).T.astype(float))  # sums from the root down
         first = 0  # rank, in level order, of the first joint on the level above
         for index, level in enumerate(levels):
-            keep(f"level_{index}", level)
-            keep(f"level_parent_{index}", where[parents[level]] - first)
+            setattr(self, f"level_{index}", keep(level))
+            setattr(self, f"level_parent_{index}", keep(where[parents[level]] - first))
             first += 1 if index == 0 else self.level_sizes[index - 1]
 
     def local_offsets(self, bind_world: Tensor) -> Tensor:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Iterator, Sequence
 
 import numpy as np
@@ -9,6 +10,7 @@ import scipy.sparse
 import torch
 from torch import Tensor
 
+from soma_core.geometry.constants import constant
 from soma_core.geometry.sparse import Csr, SparseRows, gather_rows, sparse_product
 from soma_core.geometry.torch_func import transformed
 
@@ -136,17 +138,13 @@ class Skinning(torch.nn.Module):
         )
         turned = order.T.tocsr()
 
-        def keep(name: str, array: np.ndarray) -> None:
-            self.register_buffer(
-                name, torch.as_tensor(array, dtype=torch.int64, device=device), persistent=False
-            )
-
-        keep("point_col", columns)
-        keep("point_crow", starts)
-        keep("point_t_col", turned.indices)
-        keep("point_t_crow", turned.indptr)
-        keep("point_t_order", turned.data)
-        keep("influence_vertex", np.repeat(np.arange(vertices), np.diff(weights.indptr)))
+        keep = functools.partial(constant, device=device, dtype=dtype)
+        self.point_col = keep(columns)
+        self.point_crow = keep(starts)
+        self.point_t_col = keep(turned.indices)
+        self.point_t_crow = keep(turned.indptr)
+        self.point_t_order = keep(turned.data)
+        self.influence_vertex = keep(np.repeat(np.arange(vertices), np.diff(weights.indptr)))
 
     def forward(self, points: Tensor, transforms: Tensor, *, rows: bool) -> Tensor:
         """Skinned vertices: contiguous (B, v, 3) when `rows`, else planes (3, v, B).

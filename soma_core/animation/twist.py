@@ -18,6 +18,7 @@ An angle jumps by a full turn where a joint turns through 180 degrees: no functi
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass
 
 import numpy as np
@@ -25,6 +26,7 @@ import torch
 from torch import Tensor
 
 from soma_core.animation.kinematics import to_homogeneous
+from soma_core.geometry.constants import constant
 from soma_core.geometry.rotations import matrix_to_quaternion, skew
 from soma_core.rig.procedural import ProceduralDefinition, TwistSegment
 from soma_core.rig.skeleton import Rig
@@ -93,17 +95,13 @@ class Twist(torch.nn.Module):
         step = template @ procedural.bind_world[:, :3, :3]
         axes = np.array([segment.sign * np.eye(3)[segment.axis] for segment in segments])
 
-        def keep(name: str, array: np.ndarray) -> None:
-            tensor = torch.as_tensor(np.array(array), device=device)
-            tensor = tensor.to(dtype if tensor.is_floating_point() else torch.int64)
-            self.register_buffer(name, tensor, persistent=False)
-
-        keep("start", procedural.start_joints)
-        keep("end_user", ends - 1)
-        keep("place", definition.place(names))
-        keep("step", step)
-        keep("axis", np.einsum("hab,hb->ha", step, axes))  # in the frame of the start joint
-        keep("eye", np.eye(3))
+        keep = functools.partial(constant, device=device, dtype=dtype)
+        self.start = keep(procedural.start_joints)
+        self.end_user = keep(ends - 1)
+        self.place = keep(definition.place(names))
+        self.step = keep(step)
+        self.axis = keep(np.einsum("hab,hb->ha", step, axes))  # in the frame of the start joint
+        self.eye = keep(np.eye(3))
         self._keep_channels(keep, rig)
 
     def _keep_channels(self, keep, rig: Rig) -> None:
@@ -120,18 +118,18 @@ class Twist(torch.nn.Module):
         mix = np.zeros((len(procedural.joint_names), len(channels)))
         for row, channel, value in entries:
             mix[row, channels.index(channel)] += value
-        keep("mix", mix)
-        keep("joint", np.array([channel.joint for channel in channels], np.int64))
-        keep("reference", np.array([channel.reference for channel in channels], np.int64))
+        self.mix = keep(mix)
+        self.joint = keep(np.array([channel.joint for channel in channels], np.int64))
+        self.reference = keep(np.array([channel.reference for channel in channels], np.int64))
         names, units = rig.joint_names, np.eye(3)
-        keep("low", np.array([names.index(channel.segment.start) for channel in channels], np.int64))
-        keep("high", np.array([names.index(channel.segment.end) for channel in channels], np.int64))
+        self.low = keep(np.array([names.index(channel.segment.start) for channel in channels], np.int64))
+        self.high = keep(np.array([names.index(channel.segment.end) for channel in channels], np.int64))
         signed = [channel.segment.sign * units[channel.segment.axis] for channel in channels]
-        keep("source_axis", np.array(signed).reshape(-1, 3))
+        self.source_axis = keep(np.array(signed).reshape(-1, 3))
         self.counts = [sum(channel.mode == mode for channel in channels) for mode in _ORDER]
         euler = channels[sum(self.counts[:2]) :]
-        keep("euler_axis", np.array([channel.segment.axis for channel in euler], np.int64))
-        keep("euler_sign", np.array([float(channel.segment.sign) for channel in euler]))
+        self.euler_axis = keep(np.array([channel.segment.axis for channel in euler], np.int64))
+        self.euler_sign = keep(np.array([float(channel.segment.sign) for channel in euler]))
 
     def forward(
         self, bind_world: Tensor, turns: Tensor, positions: Tensor, bone_scale: Tensor | None = None

@@ -9,6 +9,7 @@ looks at every share of it.
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Collection
 from dataclasses import dataclass, replace
@@ -17,6 +18,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from soma_core.geometry.constants import constant
 from soma_core.geometry.kabsch import rotation_from_covariance
 from soma_core.geometry.rotations import axis_angle_to_matrix, matrix_to_quaternion, skew
 from soma_core.inversion.driven import DrivenJoints, half_angle
@@ -85,18 +87,15 @@ class LimbStart(torch.nn.Module):
         )
         kind = driven.mix
 
-        def keep(name: str, array: np.ndarray) -> None:
-            tensor = torch.as_tensor(np.array(array), device=kind.device)
-            tensor = tensor.to(kind.dtype) if tensor.is_floating_point() else tensor
-            self.register_buffer(name, tensor, persistent=False)
-
-        keep("starts", np.array(starts, np.int64))
-        keep("clouds", np.array(padded, np.int64).reshape(len(starts), width))
-        keep("inner", inner.astype(np.float64).reshape(len(starts), width))
-        keep("centre", np.array(halves, np.float64))
-        keep("share", share.reshape(len(starts), width))
-        keep("regress", centred / (centred**2).sum(1, keepdims=True).clip(1e-12) if len(starts) else centred)
-        keep("axis", np.array(axes).reshape(-1, 3))
+        keep = functools.partial(constant, device=kind.device, dtype=kind.dtype)
+        self.starts = keep(np.array(starts, np.int64))
+        self.clouds = keep(np.array(padded, np.int64).reshape(len(starts), width))
+        self.inner = keep(inner.astype(np.float64).reshape(len(starts), width))
+        self.centre = keep(np.array(halves, np.float64))
+        self.share = keep(share.reshape(len(starts), width))
+        slope = centred / (centred**2).sum(1, keepdims=True).clip(1e-12) if len(starts) else centred
+        self.regress = keep(slope)
+        self.axis = keep(np.array(axes).reshape(-1, 3))
 
     def forward(self, turns: Tensor, mass: Tensor) -> Tensor:
         """World turns (F, L, 3, 3) of the joints `starts`.

@@ -12,6 +12,7 @@ world at T-pose, so that ``D_t`` is the joint's turn from the T-pose and no join
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
@@ -20,6 +21,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import embedding_bag
 
+from soma_core.geometry.constants import constant
 from soma_core.geometry.sparse import sparse_product
 from soma_core.inversion.driven import DrivenRest
 from soma_core.inversion.structure import MomentStructure
@@ -89,31 +91,29 @@ class SkinMoments(torch.nn.Module):
         self._patches: MomentPatches | None = None  # made when first asked for
         orient = rig.t_pose_world[structure.joints, :3, :3]
 
-        def keep(name: str, array: np.ndarray) -> None:
-            self.register_buffer(name, torch.as_tensor(array, device=device), persistent=False)
-
-        keep("joints", structure.joints)
-        keep("orient", orient)
-        keep("influence_joint", structure.influence_joint)
-        keep("influence_vertex", structure.influence_vertex)
-        keep("influence_weight", structure.influence_weight)
-        keep("pair_influences", structure.pair_influences)
-        keep("joint_start", _starts(structure.influence_joint, len(structure.joints)))
-        keep("pair_start", _starts(structure.pair_entry, len(structure.pairs)))
-        keep("pairs", structure.pairs)
+        keep = functools.partial(constant, device=device)
+        self.joints = keep(structure.joints)
+        self.orient = keep(orient)
+        self.influence_joint = keep(structure.influence_joint)
+        self.influence_vertex = keep(structure.influence_vertex)
+        self.influence_weight = keep(structure.influence_weight)
+        self.pair_influences = keep(structure.pair_influences)
+        self.joint_start = keep(_starts(structure.influence_joint, len(structure.joints)))
+        self.pair_start = keep(_starts(structure.pair_entry, len(structure.pairs)))
+        self.pairs = keep(structure.pairs)
         if warp:
             from soma_core.kernels.skin_moments_wp import tile_runs
 
             starts = _starts(structure.influence_joint, len(structure.joints))
             for i, one in enumerate(tile_runs(starts, structure.influence_vertex)):
-                keep(f"tile_runs_{i}", one)
+                setattr(self, f"tile_runs_{i}", keep(one))
         four = structure.influence_vertex[:, None].repeat(4, 1)
         spans = np.split(four, self.joint_start[1:-1].cpu().numpy())
-        keep("moment_col", np.concatenate([span.T.ravel() for span in spans]))
+        self.moment_col = keep(np.concatenate([span.T.ravel() for span in spans]))
         counts = np.diff(self.joint_start.cpu().numpy()).repeat(4)
-        keep("moment_crow", np.concatenate([[0], np.cumsum(counts)]))
+        self.moment_crow = keep(np.concatenate([[0], np.cumsum(counts)]))
         source = np.split(np.arange(four.size).reshape(-1, 4), self.joint_start[1:-1].cpu().numpy())
-        keep("moment_order", np.concatenate([span.T.ravel() for span in source]))
+        self.moment_order = keep(np.concatenate([span.T.ravel() for span in source]))
 
     def local_points(self, identity: Identity) -> Tensor:
         """Rest points of every influence about its joint, in T-pose world axes, (i, e, 3) [m], float64."""

@@ -12,12 +12,15 @@ rigid. What that leaves out only changes the path to the minimum.
 
 from __future__ import annotations
 
+import functools
+
 import numpy as np
 import scipy.sparse
 import torch
 from torch import Tensor
 
 from soma_core.correctives.model import Correctives
+from soma_core.geometry.constants import constant
 from soma_core.geometry.rotations import skew
 from soma_core.geometry.sparse import SparseRows
 from soma_core.inversion.moments import RestMoments
@@ -78,21 +81,17 @@ class PoseOffsets(torch.nn.Module):
         self.first = None if first is None else SparseRows(first, **kind)
         self.shapes = SparseRows(shapes, **kind)
 
-        def keep(name: str, array: np.ndarray) -> None:
-            tensor = torch.as_tensor(np.ascontiguousarray(array), device=device)
-            tensor = tensor.to(dtype) if tensor.is_floating_point() else tensor
-            self.register_buffer(name, tensor, persistent=False)
-
-        keep("left", left)
-        keep("right", right)
-        keep("still", still)
+        keep = functools.partial(constant, device=device, dtype=dtype)
+        self.left = keep(left)
+        self.right = keep(right)
+        self.still = keep(still)
         blocks = _blocks(first, owner, len(left), 3 * self.columns)
         for name, array in blocks.items():
-            keep(name, array)
+            setattr(self, name, keep(array))
         modes, moved = _modes(shapes, blocks["taken"], fitted)
-        keep("modes", modes)
+        self.modes = keep(modes)
         for name, array in _moments(moved, rig, joints, fitted).items():
-            keep(name, array)
+            setattr(self, name, keep(array))
 
     @classmethod
     def of_correctives(

@@ -7,10 +7,13 @@ the joint's own centre (the parallel-axis rule), which keeps float32 accurate at
 
 from __future__ import annotations
 
+import functools
+
 import numpy as np
 import torch
 from torch import Tensor
 
+from soma_core.geometry.constants import constant
 from soma_core.geometry.rotations import skew
 from soma_core.geometry.tree import joint_levels
 from soma_core.inversion.driven import DrivenJoints
@@ -49,22 +52,20 @@ class SkinEquations(torch.nn.Module):
         self.public_count = self.joint_count if driven is None else driven.public_count
         self.level_count = 0
 
-        def keep(name: str, array: np.ndarray) -> None:
-            self.register_buffer(name, torch.as_tensor(array, device=device), persistent=False)
-
-        keep("joints", structure.joints)
-        keep("movable", structure.variables)
-        keep("variables", structure.variables[structure.variables < self.public_count])
-        keep("parents", np.maximum(structure.parents, 0))
+        keep = functools.partial(constant, device=device)
+        self.joints = keep(structure.joints)
+        self.movable = keep(structure.variables)
+        self.variables = keep(structure.variables[structure.variables < self.public_count])
+        self.parents = keep(np.maximum(structure.parents, 0))
         first, second = structure.pairs.T
-        keep("above", structure.ancestors[structure.variables][:, structure.joints])
-        keep("pair_first", first)
-        keep("pair_second", second)
+        self.above = keep(structure.ancestors[structure.variables][:, structure.joints])
+        self.pair_first = keep(first)
+        self.pair_second = keep(second)
         for index, level in enumerate(joint_levels(structure.parents)):
-            keep(f"level_{index}", level)
-            keep(f"public_{index}", level[level < self.public_count])
+            setattr(self, f"level_{index}", keep(level))
+            setattr(self, f"public_{index}", keep(level[level < self.public_count]))
             self.level_count = index + 1
-        self.register_buffer("eye", torch.eye(3, dtype=dtype, device=device), persistent=False)
+        self.eye = keep(torch.eye(3, dtype=dtype))
 
     def dense(self, second: Tensor) -> Tensor:
         """``N`` as symmetric matrices (i, 4 T, 4 T) from its pairs (i, p, 4, 4)."""

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import functools
+
 import numpy as np
 import scipy.sparse
 import torch
 from torch import Tensor
 
 from soma_core.errors import InputError
+from soma_core.geometry.constants import constant
 from soma_core.geometry.kabsch import rotation_from_covariance
 from soma_core.geometry.sparse import SparseRows
 from soma_core.inversion.problem import Problem
@@ -47,17 +50,15 @@ class SkeletonTransfer(torch.nn.Module):
         self.regressor = SparseRows(regressor, dtype=dtype, device=device)
         self.rotations = RotationFit(rig, dtype=dtype, device=device)
 
-        def keep(name: str, array: np.ndarray) -> None:
-            self.register_buffer(name, torch.as_tensor(array, device=device), persistent=False)
-
-        keep("read", np.unique(regressor.indices))
-        keep("joints", structure.joints)
-        keep("parents", np.maximum(structure.parents, 0))
+        keep = functools.partial(constant, device=device)
+        self.read = keep(np.unique(regressor.indices))
+        self.joints = keep(structure.joints)
+        self.parents = keep(np.maximum(structure.parents, 0))
         pivots = self.rotations.pivots.cpu().numpy()
         alone = np.setdiff1d(structure.joints, pivots)
-        keep("alone", alone)
-        keep("source", _sources(structure, pivots, alone))
-        self.register_buffer("eye", torch.eye(3, dtype=dtype, device=device), persistent=False)
+        self.alone = keep(alone)
+        self.source = keep(_sources(structure, pivots, alone))
+        self.eye = keep(torch.eye(3, dtype=dtype))
 
     def forward(self, problem: Problem) -> Tensor:
         """T-pose-relative rotations (F, J, 3, 3).

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import functools
+
 import numpy as np
 import torch
 from scipy.sparse import coo_array
@@ -11,6 +13,7 @@ from torch import Tensor
 from soma_core.cache import cached_arrays, content_key
 from soma_core.errors import InputError
 from soma_core.geometry.barycentric import raised_normal
+from soma_core.geometry.constants import constant
 from soma_core.geometry.sparse import SparseRows
 from soma_core.plugin.registry import Registry, default_registry
 from soma_core.rig import load_canonical
@@ -91,17 +94,12 @@ class NativeTransfer(torch.nn.Module):
         self.affine = SparseRows(affine_matrix(back), dtype=dtype, device=device)
         frame = native_to_canonical(spec.up, spec.forward).T / METRES[spec.unit]
 
-        def keep(name: str, array: np.ndarray) -> None:
-            tensor = torch.tensor(array, device=device)
-            self.register_buffer(
-                name, tensor.to(dtype) if tensor.is_floating_point() else tensor, persistent=False
-            )
-
-        keep("corners", back.corners)
-        keep("height", back.coordinates[:, 2])
-        keep("triangles", forward.native_triangles)
-        keep("covered", _covered(back, forward.native_triangles, filled_vertices(spec, mesh), mesh))
-        keep("frame", frame)
+        keep = functools.partial(constant, device=device, dtype=dtype)
+        self.corners = keep(back.corners)
+        self.height = keep(back.coordinates[:, 2])
+        self.triangles = keep(forward.native_triangles)
+        self.covered = keep(_covered(back, forward.native_triangles, filled_vertices(spec, mesh), mesh))
+        self.frame = keep(frame)
 
     def forward(self, vertices: Tensor) -> Tensor:
         """Native vertices (F, n, 3) in the backend's unit and axes from canonical ones (F, v, 3) [m].

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from soma_core.geometry.constants import constant
 from soma_core.geometry.kabsch import rotation_from_covariance
 from soma_core.geometry.rotations import shortest_arc
 from soma_core.geometry.torch_func import transformed
@@ -78,19 +80,14 @@ class RotationFit(torch.nn.Module):
         single, several = np.flatnonzero(table[:, 1] < 0), np.flatnonzero(table[:, 1] >= 0)
         slot, column = np.nonzero(table[several] >= 0)
 
-        def keep(name: str, array: np.ndarray) -> None:
-            tensor = torch.as_tensor(np.array(array), device=device)
-            self.register_buffer(
-                name, tensor.to(dtype) if tensor.is_floating_point() else tensor, persistent=False
-            )
-
-        keep("pivots", plan.pivots)
-        keep("child_table", np.where(table < 0, plan.pivots[:, None], table))  # padded with itself
-        keep("single", single)
-        keep("single_child", table[single, 0])
-        keep("several", several)
-        keep("fan_slot", slot)
-        keep("fan_child", table[several[slot], column])
+        keep = functools.partial(constant, device=device, dtype=dtype)
+        self.pivots = keep(plan.pivots)
+        self.child_table = keep(np.where(table < 0, plan.pivots[:, None], table))  # padded with itself
+        self.single = keep(single)
+        self.single_child = keep(table[single, 0])
+        self.several = keep(several)
+        self.fan_slot = keep(slot)
+        self.fan_child = keep(table[several[slot], column])
         pairs = [
             (rank, i, j)
             for rank in range(len(several))
@@ -98,12 +95,12 @@ class RotationFit(torch.nn.Module):
             for j in np.flatnonzero(slot == rank)
             if i < j
         ]
-        keep("pair", np.array(pairs, np.int64).reshape(-1, 3).T)
-        keep("order", np.argsort(np.concatenate([single, several])))
-        keep("source", plan.source + 1)
-        keep("bind", bind)
-        keep("bones", bind - bind[np.maximum(rig.parents, 0)])
-        keep("bind_rotation", rig.bind_world[:, :3, :3])
+        self.pair = keep(np.array(pairs, np.int64).reshape(-1, 3).T)
+        self.order = keep(np.argsort(np.concatenate([single, several])))
+        self.source = keep(plan.source + 1)
+        self.bind = keep(bind)
+        self.bones = keep(bind - bind[np.maximum(rig.parents, 0)])
+        self.bind_rotation = keep(rig.bind_world[:, :3, :3])
 
     def forward(self, joints: Tensor, covariances: Tensor) -> Tensor:
         """World rotations (B, J, 3, 3) from joint positions (B, J, 3) and covariances (B, J, 3, 3)."""

@@ -6,6 +6,7 @@ topology (paper, section 3.3): barycentric coordinates on the nearest face, and 
 
 from __future__ import annotations
 
+import functools
 import hashlib
 
 import numpy as np
@@ -15,6 +16,7 @@ from torch import Tensor
 
 from soma_core.cache import cached_arrays, content_key
 from soma_core.geometry.barycentric import raised_normal, raised_normal_jacobian
+from soma_core.geometry.constants import constant
 from soma_core.rig import load_canonical
 from soma_core.rig.mesh import CanonicalMesh
 from soma_core.topology.correspondence import Correspondence, build_correspondence
@@ -59,11 +61,6 @@ class LodTransfer(torch.nn.Module):
         source_ids: ids of the source vertices that any target vertex depends on, sorted, (s,).
     """
 
-    source_ids: Tensor
-    corners: Tensor
-    shares: Tensor
-    height: Tensor
-
     def __init__(
         self, source: CanonicalMesh, target: CanonicalMesh, *, dtype: torch.dtype, device: torch.device | str
     ) -> None:
@@ -73,14 +70,11 @@ class LodTransfer(torch.nn.Module):
         source_ids, corners = np.unique(found.corners, return_inverse=True)
         first, second, height = found.coordinates.T
 
-        def keep(name: str, array: np.ndarray, kind: torch.dtype) -> None:
-            tensor = torch.as_tensor(array, dtype=kind, device=device)
-            self.register_buffer(name, tensor, persistent=False)
-
-        keep("source_ids", source_ids, torch.int64)
-        keep("corners", corners.reshape(-1, 3), torch.int64)
-        keep("shares", np.stack([1 - first - second, first, second], 1), dtype)
-        keep("height", height, dtype)
+        keep = functools.partial(constant, device=device, dtype=dtype)
+        self.source_ids = keep(source_ids)
+        self.corners = keep(corners.reshape(-1, 3))
+        self.shares = keep(np.stack([1 - first - second, first, second], 1))
+        self.height = keep(height)
 
     def forward(self, vertices: Tensor) -> Tensor:
         """Target vertices (B, t, 3) from source vertices (B, v, 3), any unit. Differentiable."""

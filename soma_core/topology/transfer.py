@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import functools
+
 import numpy as np
 import torch
 from torch import Tensor
 
 from soma_core.errors import InputError
 from soma_core.geometry.barycentric import raised_normal
+from soma_core.geometry.constants import constant
 from soma_core.geometry.sparse import SparseRows
 from soma_core.plugin.spec import BackendSpec
 from soma_core.rig.mesh import CanonicalMesh
@@ -43,10 +46,6 @@ class TopologyTransfer(torch.nn.Module):
         mesh: canonical mesh at the same LOD.
     """
 
-    corners: Tensor
-    height: Tensor
-    frame: Tensor
-
     def __init__(
         self,
         correspondence: Correspondence,
@@ -65,15 +64,10 @@ class TopologyTransfer(torch.nn.Module):
         self.fill = FillOperator(regions, dtype=dtype, device=device)
         frame = METRES[spec.unit] * native_to_canonical(spec.up, spec.forward)
 
-        def keep(name: str, array: np.ndarray) -> None:
-            tensor = torch.as_tensor(np.ascontiguousarray(array), device=device)
-            self.register_buffer(
-                name, tensor.to(dtype) if tensor.is_floating_point() else tensor, persistent=False
-            )
-
-        keep("corners", correspondence.corners)
-        keep("height", correspondence.coordinates[:, 2])
-        keep("frame", frame)
+        keep = functools.partial(constant, device=device, dtype=dtype)
+        self.corners = keep(correspondence.corners)
+        self.height = keep(correspondence.coordinates[:, 2])
+        self.frame = keep(frame)
 
     def forward(self, native: Tensor) -> Tensor:
         """Canonical rest vertices (B, v, 3) [m] from native vertices (B, n, 3). Differentiable."""
@@ -103,18 +97,14 @@ class TopologyTransfer(torch.nn.Module):
 class CanonicalPassThrough(torch.nn.Module):
     """The transfer of a backend whose native topology is the canonical one: a change of unit and axes."""
 
-    frame: Tensor
-    mid_ids: Tensor
-
     def __init__(
         self, spec: BackendSpec, mesh: CanonicalMesh, *, dtype: torch.dtype, device: torch.device | str
     ) -> None:
         super().__init__()
         self.least_count, self.is_mid = int(mesh.mid_ids.max()) + 1, mesh.lod == "mid"
         frame = METRES[spec.unit] * native_to_canonical(spec.up, spec.forward)
-        self.register_buffer("frame", torch.as_tensor(frame, dtype=dtype, device=device), persistent=False)
-        ids = torch.as_tensor(mesh.mid_ids.astype(np.int64), device=device)
-        self.register_buffer("mid_ids", ids, persistent=False)
+        self.frame = constant(frame, device=device, dtype=dtype)
+        self.mid_ids = constant(mesh.mid_ids, device=device, dtype=dtype)
 
     def forward(self, native: Tensor) -> Tensor:
         """Canonical rest vertices (B, v, 3) [m] from mid-LOD native vertices (B, n, 3)."""
