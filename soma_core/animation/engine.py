@@ -48,7 +48,7 @@ class Animation(torch.nn.Module):
         # Measured (benchmarks/README.md): on CPU Warp wins the tree walk and torch the sparse blend.
         self.warp_skinning = kernels == "warp" or (kernels == "auto" and device.type == "cuda")
         self.kinematics = Kinematics(rig, dtype=dtype, device=device, warp=kernels != "torch")
-        self.skinning = Skinning(rig.weights, dtype=dtype, device=device)
+        self.skinning = Skinning(rig.skin, dtype=dtype, device=device)
         self.posed_skinning = self.skinning
         self.patches: Patches | None = None
         self.blend: Blend | None = None
@@ -220,7 +220,7 @@ class ProceduralAnimation(Animation):
         super().__init__(rig, dtype=dtype, device=device, kernels=kernels)
         assert rig.procedural is not None
         self.twist = Twist(rig, dtype=dtype, device=device)
-        self.posed_skinning = Skinning(rig.procedural.weights, dtype=dtype, device=device)
+        self.posed_skinning = Skinning(rig.procedural.skin, dtype=dtype, device=device)
 
     def _skinning_transforms(
         self, identity: Identity, rotations: Tensor, positions: Tensor, bone_scale: Tensor | None

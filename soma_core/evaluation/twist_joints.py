@@ -12,7 +12,7 @@ from torch import Tensor
 from soma_core.evaluation.report import Figure, Report, ShownBody, Table
 from soma_core.geometry.mesh import enclosed_volume
 from soma_core.layer import SomaLayer
-from soma_core.rig.stored import fold_weights
+from soma_core.rig.procedural import fold_weights
 
 __all__ = ["run"]
 

@@ -331,9 +331,7 @@ def _moments(
 ) -> dict[str, np.ndarray]:
     """Products of modes, and their torque about and force on each weighted joint, in the joint's own axes."""
     planes = [moved[axis::3] for axis in range(3)]
-    weights = scipy.sparse.csr_array(
-        rig.weights.tocsc()[:, joints].T @ scipy.sparse.diags_array(fitted * 1.0)
-    )
+    weights = scipy.sparse.csr_array(rig.skin.tocsc()[:, joints].T @ scipy.sparse.diags_array(fitted * 1.0))
     force = np.stack([_full(weights @ plane) for plane in planes], 1)  # (T, 3, M)
     arms = [
         scipy.sparse.csr_array(weights @ scipy.sparse.diags_array(rig.bind_shape[:, a])) for a in range(3)

@@ -91,7 +91,7 @@ class SkinModel(torch.nn.Module):
         self.start = ProcrustesStart(
             structure, public_count=self.solver.public_count, limbs=limbs, warp=warp, **kind
         )
-        self._warp, self._kind, self._skin = warp, kind, rig.weights
+        self._warp, self._kind, self._skin = warp, kind, rig.skin
         self._steps = self._step_kernels() if self.solver.kernels is not None else None
         orient = rig.t_pose_world[:, :3, :3].copy()
         orient[0] = np.eye(3)

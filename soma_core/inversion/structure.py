@@ -68,7 +68,7 @@ def skin_structure(rig: Rig, fitted: np.ndarray) -> MomentStructure:
         rig: any skinned mesh whose joint 0 is a virtual root without weight.
         fitted: (v,) bool, vertices that a fit may look at.
     """
-    weights = scipy.sparse.coo_array(rig.weights)
+    weights = scipy.sparse.coo_array(rig.skin)
     chosen = (weights.data > 0) & fitted[weights.row] & (weights.col > 0)
     vertex, joint, weight = weights.row[chosen], weights.col[chosen], weights.data[chosen]
     order = np.lexsort((vertex, joint))

@@ -97,7 +97,7 @@ class SkinnedClip:
 
     def influences(self) -> tuple[np.ndarray, np.ndarray]:
         """Joint ids (v, k) int and weights (v, k) float32 of every influence, heaviest first, zero padded."""
-        joint_ids, values = padded_influences(self.rig.weights.tocsr())
+        joint_ids, values = padded_influences(self.rig.skin)
         return joint_ids, (values / values.sum(axis=1, keepdims=True)).astype(np.float32)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Literal, get_args
@@ -9,7 +10,18 @@ from typing import Literal, get_args
 import numpy as np
 import scipy.sparse
 
-__all__ = ["MODES", "ProceduralDefinition", "ProceduralRig", "TwistMode", "TwistSegment"]
+__all__ = [
+    "MODES",
+    "ProceduralDefinition",
+    "ProceduralRig",
+    "TwistMode",
+    "TwistSegment",
+    "effective_weights",
+    "fold_weights",
+]
+
+_LEAST_WEIGHT = 2.0**-24
+"""Half of the spacing of float32 above one."""
 
 TwistMode = Literal["local_x_euler", "local_x_swing_twist", "aligned_x_swing_twist"]
 """How a twist angle is read from a posed joint; see :mod:`soma_core.animation.twist`."""
@@ -89,6 +101,26 @@ class ProceduralDefinition:
         return total
 
 
+def fold_weights(weights: scipy.sparse.csr_array, target: np.ndarray, count: int) -> scipy.sparse.csr_array:
+    """Add each column of skin weights (v, n) to its target column: (v, count)."""
+    moves = (np.ones(len(target)), (np.arange(len(target)), target))
+    folded = scipy.sparse.csr_array(weights @ scipy.sparse.csr_array(moves, shape=(len(target), count)))
+    folded.sort_indices()
+    return folded
+
+
+def effective_weights(weights: scipy.sparse.csr_array) -> scipy.sparse.csr_array:
+    """Drop the skin weights that float32 rounds away beside one; rows sum to one again.
+
+    Painting tools store weights down to 1e-45: a fifth of this rig's, in two fifths of the pairs of joints
+    that a fit sums over. All that a vertex loses moves it by less than a micrometre.
+    """
+    kept = weights.copy()
+    kept.data[kept.data < _LEAST_WEIGHT] = 0.0
+    kept.eliminate_zeros()
+    return scipy.sparse.csr_array(scipy.sparse.diags_array(1.0 / kept.sum(axis=1)) @ kept)
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
 class ProceduralRig:
     """Procedural joints of a rig and the skin weights that include them.
@@ -107,3 +139,8 @@ class ProceduralRig:
     bind_world: np.ndarray
     weights: scipy.sparse.csr_array
     definition: ProceduralDefinition
+
+    @functools.cached_property
+    def skin(self) -> scipy.sparse.csr_array:
+        """The weights that move a vertex, (v, J + H) CSR; see :func:`effective_weights`."""
+        return effective_weights(self.weights)

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass
 
 import numpy as np
 import scipy.sparse
 
-from soma_core.rig.procedural import ProceduralRig
+from soma_core.rig.procedural import ProceduralRig, effective_weights, fold_weights
 
 __all__ = ["Rig"]
 
@@ -47,3 +48,11 @@ class Rig:
     def user_joint_names(self) -> tuple[str, ...]:
         """Names of the joints that a pose controls: all but Root."""
         return self.joint_names[1:]
+
+    @functools.cached_property
+    def skin(self) -> scipy.sparse.csr_array:
+        """The weights that move a vertex, (v, J) CSR; those of twist joints go to their start joints."""
+        if self.procedural is None:
+            return effective_weights(self.weights)
+        places = np.append(np.arange(self.joint_count), self.procedural.start_joints)
+        return fold_weights(self.procedural.skin, places, self.joint_count)

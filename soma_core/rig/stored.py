@@ -12,11 +12,12 @@ import scipy.sparse
 
 from soma_core.errors import AssetError
 from soma_core.geometry.tree import depth_order
+from soma_core.rig.procedural import fold_weights
 from soma_core.rig.revision import REVISION_DIGITS, rig_hash
 from soma_core.rig.skeleton import Rig
 from soma_core.rig.transforms import project_rotations
 
-__all__ = ["ROW_SUM_TOLERANCE", "StoredRig", "fold_weights", "refuse_bad_weights"]
+__all__ = ["ROW_SUM_TOLERANCE", "StoredRig", "refuse_bad_weights"]
 
 ROW_SUM_TOLERANCE = 1e-4  # float32 weights of up to 14 influences, with room for other exporters
 
@@ -140,11 +141,3 @@ class StoredRig:
             weights=weights,
             revision=digest[:REVISION_DIGITS],
         )
-
-
-def fold_weights(weights: scipy.sparse.csr_array, target: np.ndarray, count: int) -> scipy.sparse.csr_array:
-    """Add each column of skin weights (v, n) to its target column: (v, count)."""
-    moves = (np.ones(len(target)), (np.arange(len(target)), target))
-    folded = scipy.sparse.csr_array(weights @ scipy.sparse.csr_array(moves, shape=(len(target), count)))
-    folded.sort_indices()
-    return folded

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from assets.make.twist_weights import _exact_parts, _shares, spread_weights
 from soma_core.rig import load_canonical
-from soma_core.rig.stored import fold_weights
+from soma_core.rig.procedural import fold_weights
 
 NODES = (0.0, 0.05, 0.3333333, 0.6666667, 0.95)
 ROUNDING = 1e-12

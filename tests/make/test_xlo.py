@@ -15,7 +15,7 @@ from assets.make.symmetry import mirror_vertices
 from soma_core.errors import SomaError
 from soma_core.geometry.barycentric import closest_point_on_triangle
 from soma_core.rig import load_canonical
-from soma_core.rig.stored import fold_weights
+from soma_core.rig.procedural import fold_weights
 
 needs_source = pytest.mark.skipif(importlib.util.find_spec("anny") is None, reason="anny is not installed")
 
