@@ -6,7 +6,7 @@
     python benchmarks/run.py --peer-python peer/bin/python
 
 Writes ``forward_cpu.json`` and ``inversion_cpu.json`` in ``benchmarks/results``, the tables in
-``benchmarks/README.md``, and a short one in ``README.md``. Bars that are missed are said there.
+``benchmarks/README.md``, and a short one in ``docs/benchmarks.md``. Bars that are missed are said there.
 """
 
 from __future__ import annotations
@@ -45,12 +45,12 @@ def rounded(value: object) -> object:
 
 
 def store(name: str, mark: str, results: dict, text: str, short: str = "") -> None:
-    """Write the results and put their table into both READMEs, `short` in the front one."""
+    """Write the results and put their table into the README beside, `short` into the documentation."""
     path = HERE / "results" / f"{name}.json"
     path.parent.mkdir(exist_ok=True)
     path.write_text(json.dumps(rounded(results), separators=(",", ":")) + "\n", encoding="utf-8")
     insert(HERE / "README.md", mark, text)
-    insert(ROOT / "README.md", mark, short or text)
+    insert(ROOT / "docs/benchmarks.md", mark, short or text)
     sys.stdout.write(text + "\n")
 
 

@@ -166,7 +166,7 @@ class SomaLayer(Derived):
         """Prepare identities: rest shape on the canonical mesh and the skeleton fitted to it.
 
         Args:
-            params: name -> number, list, array or tensor of shape (batch, *shape) or one sample; what is
+            params: name -> number, list, array or tensor of shape ``(batch, *shape)`` or one sample; what is
                 left out takes its default. ``soma backends show`` lists names and ranges.
 
         Returns:

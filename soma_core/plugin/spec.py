@@ -133,7 +133,7 @@ class Generator(Protocol):
     def rest(self, params: Mapping[str, Tensor]) -> Tensor:
         """Rest vertices (batch, n, 3) in the native unit, topology and axes.
 
-        ``params`` holds every declared parameter, shape (batch, *parameter.shape), on the device
+        ``params`` holds every declared parameter, shape ``(batch, *parameter.shape)``, on the device
         and in the dtype the generator was built for. Differentiable where the model is.
         """
         ...
