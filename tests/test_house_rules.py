@@ -83,7 +83,7 @@ LISTS = {"soma_core/__init__.py", "soma_core/motion/__init__.py", "soma_core/plu
 # Packages that stand alone: nothing else of the core, whatever its rank.
 ALONE = {"geometry": {"errors"}, "plugin": {"_lazy", "_version", "errors", "paths", "cache"}}
 
-TOP_LEVEL = {"soma_core", "plugins", "assets", "configs", "tests", "benchmarks", "docs", ".ci"}
+TOP_LEVEL = {"soma_core", "plugins", "assets", "configs", "tests", "benchmarks", "docs", ".ci", ".github"}
 EQUATIONS = {
     1: "topology/transfer.py",
     2: "geometry/rbf.py",
