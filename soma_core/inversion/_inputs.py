@@ -64,16 +64,17 @@ def refuse_transforms() -> None:
         )
 
 
-def refuse_unit_error(scale: Tensor) -> None:
+def refuse_unit_error(scale: Tensor, name: str = "vertices") -> None:
     """Refuse a sequence whose frames are all the same power of ten too large or too small."""
     typical = float(scale.median())
     for factor in _UNIT_FACTORS:
         if 0.5 < typical / factor < 2:
+            points = name == "points"
             raise InputError(
-                "vertices",
+                name,
                 got=f"bodies {typical:.4g} times the size of their identity",
-                expected="metres on the canonical topology, or the backend's own unit",
-                fix=f"Multiply the vertices by {1 / factor:g}.",
+                expected="metres" if points else "metres on the canonical topology, or the backend's own unit",
+                fix=f"Multiply the {name} by {1 / factor:g}.",
             )
 
 

@@ -1,0 +1,246 @@
+"""One fit of poses to points: the pose under way, the noise that weighs priors, and what came of it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from soma_core.inversion._inputs import refuse_unit_error
+from soma_core.inversion.point_model import PointModel, PointRest
+from soma_core.inversion.point_start import PointStart
+from soma_core.inversion.problem import Pose, part_of
+from soma_core.inversion.result import InversionResult
+from soma_core.skeleton.identity import Identity
+
+__all__ = ["PointFit", "PointResult"]
+
+_CHUNK = 2048
+"""Frames fitted at a time."""
+
+_FIRST_NOISE, _LEAST_NOISE, _MOST_NOISE = 5e-3, 5e-5, 0.2
+"""Noise of a coordinate [m]: where its estimate begins, and its bounds."""
+
+_EXACT = 4.0
+"""Noise below so many times the least is none: the points are then met without regard to what is expected."""
+
+_SETTLED, _LOOKS = 1.5, 5
+"""The estimate rests when it changes by less than this factor; it is made at most so many times."""
+
+_SAMPLED = 32
+"""Frames that tell how many degrees of freedom the points take up."""
+
+_FEWEST = 3
+"""A frame with fewer known points is not fitted."""
+
+_CORRECTIONS = 3
+"""How often what twist joints and correctives do to points of the skin is looked at."""
+
+_SURE = 0.5
+"""A joint is determined where its angle is surer than this share of what is expected of it anyway."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class PointResult(InversionResult):
+    """The pose of every frame, and how well it explains the points.
+
+    ``vertex_error`` is that of the points, (frames, P). ``determined`` says which joints the points tell more of
+    than what is expected of a person anyway; ``angle_std`` of the others is the spread that is expected.
+
+    Attributes:
+        noise: standard deviation of a coordinate of the points [m], as it was given or found.
+    """
+
+    noise: float
+
+    @property
+    def point_error(self) -> Tensor:
+        """Distance of each point to its target [m], (frames, P); NaN where it is not known."""
+        return self.vertex_error
+
+
+class _Chunk(NamedTuple):
+    """Some frames of a fit."""
+
+    frames: slice
+    rest: PointRest
+    points: Tensor
+    weights: Tensor
+    pose: Pose
+
+
+class PointFit:
+    """Poses of the frames of one call.
+
+    Args:
+        model, start: of the points.
+        points: targets (F, P, 3) [m], finite.
+        weights: (1 or F, P), 0 for what is not known.
+        identity: batch of 1 or F.
+        bone_scale: (1 or F, J - 1); None without.
+        noise: of a coordinate [m]; None to estimate it.
+        iterations: largest number of steps of each look.
+    """
+
+    def __init__(
+        self,
+        model: PointModel,
+        start: PointStart,
+        points: Tensor,
+        weights: Tensor,
+        identity: Identity,
+        bone_scale: Tensor | None,
+        *,
+        noise: float | None,
+        iterations: int,
+    ) -> None:
+        self.model, self.start, self.identity, self.bone_scale = model, start, identity, bone_scale
+        self.weights, self.rest = weights, model.rest(identity, bone_scale)
+        self.given, self.iterations = noise, iterations
+        self.every = every = weights.expand(len(points), -1)
+        self.valid = (every > 0).sum(1) >= _FEWEST
+        total = every.sum(1, keepdim=True).clamp_min(1e-12)
+        self.origin = (every[..., None] * points).sum(1) / total
+        self.points = (points - self.origin[:, None]) * (every > 0)[..., None]
+        self.noise = _FIRST_NOISE if noise is None else noise
+        self.shift = torch.zeros_like(self.points)
+        still = model.mean.expand(len(points), -1, 3, 3)
+        self.pose = Pose.begin(still, torch.zeros_like(self.origin))
+
+    def chunks(self) -> Iterator[_Chunk]:
+        """The frames, some at a time."""
+        for first in range(0, len(self.points), _CHUNK):
+            part = slice(first, first + _CHUNK)
+            pose = Pose(**{name: value[part] for name, value in vars(self.pose).items()})
+            weights = self.weights if len(self.weights) == 1 else self.weights[part]
+            yield _Chunk(part, self._rest_of(part), self.points[part] - self.shift[part], weights, pose)
+
+    def _rest_of(self, part: slice | Tensor) -> PointRest:
+        rest = self.rest
+        if len(rest.local) == 1:
+            return rest
+        return PointRest(local=rest.local[part], offsets=rest.offsets[part])
+
+    def begin(self, initial: InversionResult | None) -> None:
+        """Start from the points, or from an earlier result."""
+        begun = [self.start(one.rest, one.points, one.weights) for one in self.chunks()]
+        relative, hips, scale = (torch.cat(parts) for parts in zip(*begun, strict=True))
+        if bool(self.valid.any()):
+            refuse_unit_error(scale[self.valid], "points")
+        if initial is not None:
+            still = torch.eye(3).to(self.points).expand(len(self.points), 1, 3, 3)
+            relative = torch.cat((still, initial.rotations.to(self.points)), 1)
+            hips = initial.translation.to(self.points) - self.origin
+        self.pose = Pose.begin(relative, hips)
+
+    def run(self) -> None:
+        """Fit, with a look at the noise, and at what skin does, until both rest."""
+        corrections = _CORRECTIONS if self.model.corrected else 0
+        for look in range(_LOOKS):
+            self._solve(self.noise)
+            before, self.noise = self.noise, self._estimate() if self.given is None else self.given
+            if look < corrections:
+                self._correct()
+            elif max(before, self.noise) <= _SETTLED * min(before, self.noise):
+                break
+        if self.given is None and self.noise < _EXACT * _LEAST_NOISE:
+            self._solve(_LEAST_NOISE / 10)
+        elif self.noise != before:
+            self._solve(self.noise)
+
+    def _solve(self, noise: float) -> None:
+        """Steps of all frames under a noise [m]."""
+        done = []
+        for one in self.chunks():
+            moments = self.model.moments(one.rest, one.weights, noise**2)
+            target = self.model.target(one.rest, one.points, one.weights)
+            done.append(
+                self.model.solver(
+                    target, moments, one.pose, iterations=self.iterations, tolerance=0.01 * min(noise, 1e-3)
+                )
+            )
+        self.pose = Pose(**{name: torch.cat([vars(one)[name] for one in done]) for name in vars(self.pose)})
+
+    def _misses(self, one: _Chunk) -> Tensor:
+        """What points of a chunk miss, (f, P, 3) [m]."""
+        return self.model.points(one.rest, *self.model.solver.walk(one.pose, one.rest)) - one.points
+
+    def _estimate(self) -> float:
+        """Noise of a coordinate [m], from what is left beside the freedom that the points take up."""
+        energy = torch.cat([
+            (one.weights[..., None] * self._misses(one).square()).sum((1, 2)) for one in self.chunks()
+        ])[self.valid]  # fmt: skip
+        some = torch.nonzero(self.valid).flatten()
+        if not len(some):
+            return self.noise
+        some = some[torch.linspace(0, len(some) - 1, min(len(some), _SAMPLED)).round().long()]
+        seen = 3 * (self.every > 0)[self.valid].sum(1).to(energy).mean()
+        spare = seen - self._taken(some)
+        if spare < 1:  # the points just determine the pose: nothing is left to tell the noise by
+            return _FIRST_NOISE
+        return float((energy.mean() / spare).sqrt().clamp(_LEAST_NOISE, _MOST_NOISE))
+
+    def _matrix(self, some: Tensor, noise: float) -> Tensor:
+        """Gauss-Newton matrix (f, 3 n + 3, 3 n + 3) of some frames, float64."""
+        rest, pose = self._rest_of(some), self.pose.part(some)
+        turns, places = self.model.solver.walk(pose, rest)
+        weights = self.weights if len(self.weights) == 1 else self.weights[some]
+        moments = self.model.moments(rest, weights, noise**2)
+        matrix, _ = self.model.solver.normal_equations(turns, places, moments)
+        return matrix.flatten(3, 4).flatten(1, 2).double()
+
+    def _taken(self, some: Tensor) -> Tensor:
+        """Mean degrees of freedom that the points take up in some frames."""
+        whole = self._matrix(some, self.noise)
+        diagonal = whole.diagonal(dim1=-2, dim2=-1)
+        diagonal += 1e-9 * diagonal.mean(1, keepdim=True)
+        factor, _ = torch.linalg.cholesky_ex(whole)
+        share = torch.cholesky_solve(self._matrix(some, 0.0), factor)
+        return share.diagonal(dim1=-2, dim2=-1).sum(1).mean()
+
+    def _correct(self) -> None:
+        """What twist joints and correctives do to the points, beside plain skinning."""
+        layer, places = self.model.layer, self.model.places
+        for one in self.chunks():
+            plain = self._misses(one) + one.points
+            scale = self.bone_scale
+            posed = layer.pose(
+                part_of(self.identity, one.frames), one.pose.relative[:, 1:], one.pose.translation,
+                bone_scale=scale if scale is None or len(scale) == 1 else scale[one.frames],
+            )  # fmt: skip
+            self.shift[one.frames] = places(posed.transforms, posed.vertices[:, places.vertex_ids]) - plain
+
+    def _angle_std(self) -> Tensor:
+        """Standard deviation (F, J - 1) [degrees] of each joint's own turn."""
+        model = self.model
+        every = model.spread.expand(len(self.points), -1).clone()
+        for one in self.chunks():
+            moments = model.moments(one.rest, one.weights, self.noise**2)
+            variance = model.variances(moments, one.pose)
+            every[one.frames, model.solver.variables] = (self.noise * variance.clamp_min(0).sqrt()).rad2deg()
+        return every[:, 1:]
+
+    def result(self, known: Tensor) -> PointResult:
+        """What the pose is worth; `known` (F, P) tells which points are."""
+        valid = self.valid
+        error = torch.cat([self._misses(one).norm(dim=-1) for one in self.chunks()])
+        mass = self.every.sum(1).clamp_min(1e-12)
+        residual = ((self.every * error.square()).sum(1) / mass).sqrt()
+        eye = torch.eye(3, dtype=error.dtype, device=error.device)
+        std = self._angle_std()
+        surely = std < _SURE * self.model.spread[1:]
+        return PointResult(
+            rotations=torch.where(valid[:, None, None, None], self.pose.relative, eye)[:, 1:],
+            translation=torch.where(valid[:, None], self.pose.translation + self.origin, 0.0),
+            vertex_error=error.masked_fill(~(known & valid[:, None]), torch.nan),
+            valid=valid,
+            determined=surely & valid[:, None],
+            converged=(self.pose.last_change < 0.1 * self.noise) & valid,
+            iterations=self.pose.accepted,
+            residual=residual.masked_fill(~valid, torch.nan),
+            angle_std=std.masked_fill(~valid[:, None], torch.nan),
+            noise=self.noise,
+        )

@@ -1,0 +1,115 @@
+"""What is known of a person's joints when only points are seen: where they rest, and how far they turn."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from soma_core.geometry.rotations import axis_angle_to_matrix
+
+__all__ = ["JOINTS", "JointPrior", "JointRange"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class JointRange:
+    """How a joint is expected to turn from the T-pose.
+
+    Attributes:
+        rest: rotation vector [degrees] that it is expected at, in the axes of the world at T-pose.
+        axis: of the first of the three spreads, in the same axes: what a hinge turns about.
+        spread: standard deviations [degrees] about `axis`, and about every axis across it.
+        flexes: whether the joint is a hinge that bends the limb towards positive angles about `axis`.
+    """
+
+    rest: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    axis: tuple[float, float, float] = (1.0, 0.0, 0.0)
+    spread: tuple[float, float] = (20.0, 20.0)
+    flexes: bool = False
+
+
+def _joints() -> dict[str, JointRange]:
+    """Pattern -> range of the left side and the middle."""
+    x, y, z = (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)
+    return {
+        r"Spine\d|Chest": JointRange(axis=y, spread=(10, 12)),
+        r"Neck\d": JointRange(axis=y, spread=(12, 12)),
+        r"Head": JointRange(axis=y, spread=(20, 18)),
+        r"Jaw|.*Eye": JointRange(axis=x, spread=(6, 6)),
+        r"LeftShoulder": JointRange(axis=x, spread=(10, 12)),
+        r"LeftArm": JointRange(rest=(0, 0, -50), axis=x, spread=(35, 45)),
+        r"LeftForeArm": JointRange(rest=(0, -25, 0), axis=(0, -1, 0), spread=(45, 6), flexes=True),
+        r"LeftHand": JointRange(axis=x, spread=(30, 25)),
+        r"LeftHand(Index|Middle|Ring|Pinky)1": JointRange(axis=z, spread=(4, 4)),
+        r"LeftHand(Index|Middle|Ring|Pinky)2": JointRange(axis=z, spread=(30, 8)),
+        r"LeftHand(Index|Middle|Ring|Pinky)[34]": JointRange(axis=z, spread=(30, 4)),
+        r"LeftHandThumb\d": JointRange(axis=x, spread=(15, 20)),
+        r"LeftLeg": JointRange(axis=y, spread=(20, 35)),
+        r"LeftShin": JointRange(rest=(15, 0, 0), axis=x, spread=(40, 5), flexes=True),
+        r"LeftFoot": JointRange(axis=y, spread=(10, 20)),
+        r"LeftToeBase": JointRange(axis=x, spread=(15, 4)),
+    }
+
+
+JOINTS: Mapping[str, JointRange] = _joints()
+"""Ranges by a pattern of the joint's name, for the left side and the middle; the right side mirrors the left."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class JointPrior:
+    """Expected turns of all joints.
+
+    Attributes:
+        ranges: joint name or pattern -> range; the first that fits counts.
+        mirrored: also for ``Right...`` what ``Left...`` says, mirrored.
+    """
+
+    ranges: Mapping[str, JointRange] = field(default_factory=lambda: JOINTS)
+
+    def range_of(self, name: str) -> JointRange | None:
+        """Range of a joint."""
+        for pattern, found in self.ranges.items():
+            if re.fullmatch(pattern, name):
+                return found
+        if not name.startswith("Right"):
+            return None
+        left = self.range_of("Left" + name.removeprefix("Right"))
+        return None if left is None else _mirrored(left)
+
+    def of(self, names: Sequence[str]) -> tuple[np.ndarray, np.ndarray]:
+        """Rest rotations (J, 3, 3), and matrices L (J, 3, 3) of the pull [1/rad^2].
+
+        A turn by a small angle w from the rest costs ``w^T (tr(L) I - L) w``, which is the inverse of the
+        squared spread about each axis.
+        """
+        import torch
+
+        rest, pull = np.tile(np.eye(3), (len(names), 1, 1)), np.zeros((len(names), 3, 3))
+        for row, name in enumerate(names):
+            found = self.range_of(name)
+            if found is None:
+                continue
+            vector = torch.tensor(np.radians(found.rest))
+            rest[row] = axis_angle_to_matrix(vector).numpy()
+            axis = np.asarray(found.axis, float) / np.linalg.norm(found.axis)
+            about, across = 1 / np.radians(found.spread) ** 2
+            along = max(across - about / 2, 0)
+            pull[row] = along * np.outer(axis, axis) + about / 2 * (np.eye(3) - np.outer(axis, axis))
+        return rest, pull
+
+    def hinges(self, names: Sequence[str]) -> dict[int, np.ndarray]:
+        """Joint -> unit axis about which it bends the limb."""
+        found = {row: self.range_of(name) for row, name in enumerate(names)}
+        return {
+            row: np.asarray(one.axis, float) / np.linalg.norm(one.axis)
+            for row, one in found.items() if one is not None and one.flexes
+        }  # fmt: skip
+
+
+def _mirrored(left: JointRange) -> JointRange:
+    """The range of the other side: turns mirror as axial vectors, x stays, y and z change their sign."""
+    flip = np.array([1.0, -1.0, -1.0])
+    rest, axis = (tuple((flip * np.array(one)).tolist()) for one in (left.rest, left.axis))
+    return JointRange(rest=rest, axis=axis, spread=left.spread, flexes=left.flexes)

@@ -1,0 +1,183 @@
+"""Where a fit to points begins: bone after bone from the root, each turned to the points nearest below it."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from soma_core.geometry.kabsch import rotation_from_covariance
+from soma_core.inversion.point_model import PointModel, PointRest
+
+__all__ = ["PointStart"]
+
+_FARTHER = 1e-3
+"""What points behind a further joint that is itself seen count in the turn of a bone, beside the nearest."""
+
+_EXPECTED = 0.02
+"""Weight of the expected turn beside the points: decides the twist of a bone, and hardly its direction."""
+
+_BEND = 0.5
+"""Weight of the axis that a hinge bends about, beside the bone that leads to it."""
+
+_NEAR = 0.02
+"""A point this close to a joint's centre at rest shows where the joint is [m]."""
+
+
+class PointStart(torch.nn.Module):
+    """Turns every joint by the points below it, from the root to the leaves.
+
+    Args:
+        model: the points on the rig.
+        hinges: joint -> axis about which it bends the limb, in the axes of the world at T-pose.
+        warp: nearest rotations by the Warp twin.
+    """
+
+    def __init__(self, model: PointModel, hinges: dict[int, np.ndarray], *, warp: bool) -> None:
+        super().__init__()
+        self.model, self.warp = model, warp
+        parents = model.structure.parents
+        rest = model.rest(model.layer.identity())
+        local = rest.local[0].double().cpu().numpy()  # (P, T, 4)
+        owner = model.joints[np.abs(local[..., 3]).argmax(1)]
+        centre = np.full(len(parents), -1)
+        bones = rest.offsets[0].double().cpu().numpy()
+        for joint in range(1, len(parents)):
+            above = max(int(parents[joint]), 1)
+            own = np.flatnonzero(owner == above)
+            place = bones[joint] * (joint > 1)
+            rows = local[own, np.searchsorted(model.joints, above)][:, :3] if len(own) else np.zeros((0, 3))
+            away = np.linalg.norm(rows - place, axis=1)
+            if len(own) and away.min() < 1e-4:  # exactly the centre: what else a body has, is not
+                centre[joint] = own[away.argmin()]
+        self.centre = centre
+        above = model.structure.ancestors
+        self.steps: list[tuple[int, int, np.ndarray, tuple[int, np.ndarray] | None]] = []
+        for joint in model.variables:
+            below = np.flatnonzero(above[joint, owner])
+            weight = np.zeros(len(owner))
+            for point in below:
+                step, seen = int(owner[point]), 0
+                while step != joint:
+                    seen += centre[step] >= 0
+                    step = int(parents[step])
+                weight[point] = _FARTHER**seen
+            if joint > 1 and centre[joint] >= 0:
+                weight[centre[joint]] = 0
+            hinge = next(((j, hinges[j]) for j in hinges if parents[j] == joint and centre[j] >= 0), None)
+            self.steps.append((int(joint), int(parents[joint]), weight, hinge))
+        self.owner = owner
+
+    def forward(self, rest: PointRest, points: Tensor, weights: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """T-pose-relative rotations (F, J, 3, 3), Hips positions (F, 3) [m], and sizes (F,) beside the identity.
+
+        Args:
+            rest: of one identity, or of one a frame.
+            points: targets (F, P, 3) [m], finite.
+            weights: (1 or F, P), 0 for points that are not known.
+        """
+        model, count = self.model, len(points)
+        mean = model.mean
+        at_rest, turns_rest = self._expected(rest)
+        weights = weights.expand(count, -1)
+        turns = torch.eye(3, dtype=points.dtype, device=points.device).repeat(count, model.solver.joint_count, 1, 1)
+        places = points.new_zeros(count, model.solver.joint_count, 3)
+        known = {int(j): (turn, weight, hinge) for j, turn, weight, hinge in self.steps}
+        hips = points.new_zeros(count, 3)
+        for joint in range(1, model.solver.joint_count):
+            above = max(int(model.structure.parents[joint]), 0)
+            expected = turns[:, above] @ mean[joint]
+            if joint > 1:
+                offset = rest.offsets[:, joint]
+                place = places[:, above] + (turns[:, above] @ offset[..., None]).squeeze(-1)
+                if self.centre[joint] >= 0:
+                    seen = weights[:, self.centre[joint], None] > 0
+                    place = torch.where(seen, points[:, self.centre[joint]], place)
+                places[:, joint] = place
+            if joint not in known:
+                turns[:, joint] = expected
+                continue
+            _, own, hinge = known[joint]
+            weight = weights * points.new_tensor(own)
+            arms = at_rest[:, joint]  # (i, P, 3) in the joint's axes
+            if joint == 1:
+                total = weight.sum(1, keepdim=True).clamp_min(1e-12)
+                middle = (weight[..., None] * points).sum(1) / total
+                inner = (weight[..., None] * arms).sum(1) / total
+                turns[:, 1] = self._turn(weight, points - middle[:, None], arms - inner[:, None], expected, None)
+                hips = middle - (turns[:, 1] @ inner[..., None]).squeeze(-1)
+                places[:, 1] = hips
+                continue
+            bend = None if hinge is None else self._bend(hinge, points, weights, places[:, joint])
+            turns[:, joint] = self._turn(weight, points - places[:, joint, None], arms, expected, bend)
+        parents = model.parents
+        relative = turns[:, parents].mT @ turns
+        relative[:, 0] = turns[:, 0]
+        relative[:, 1] = turns[:, 1]
+        return relative, hips, self._scale(points, weights, at_rest)
+
+    def _scale(self, points: Tensor, weights: Tensor, at_rest: Tensor) -> Tensor:
+        """Median (F,) over the bones of how far points lie from their joint, beside how far they should.
+
+        Bones between a joint that is seen and the nearest points below it; the whole cloud without such.
+        """
+        ratios = []
+        for joint, _, own, _ in self.steps:
+            centre = self.centre[joint]
+            if centre < 0:
+                continue
+            weight = weights * points.new_tensor(own == 1) * (weights[:, centre, None] > 0)
+            away = (points - points[:, centre, None]).norm(dim=-1)
+            total = (weight * at_rest[:, joint].norm(dim=-1)).sum(1)
+            ratio = (weight * away).sum(1) / total
+            ratios.append(torch.where(total > 0, ratio, torch.nan))
+        if not ratios:
+            return points.new_ones(len(points))
+        return torch.stack(ratios, 1).nanmedian(1).values.nan_to_num(1.0)
+
+    def _turn(self, weight: Tensor, aims: Tensor, arms: Tensor, expected: Tensor, bend) -> Tensor:
+        """Turn (F, 3, 3) of arms (i, P, 3) towards aims (F, P, 3)."""
+        covariance = (weight[..., None] * aims).mT @ arms
+        size = (weight * aims.norm(dim=-1) * arms.norm(dim=-1)).sum(1)
+        if bend is not None:
+            normal, axis = bend
+            share = _BEND * size[:, None, None]
+            covariance = covariance + share * normal[..., :, None] * axis
+        covariance = covariance + (_EXPECTED * size + 1e-12)[:, None, None] * expected
+        return self._nearest(covariance)
+
+    def _bend(self, hinge, points: Tensor, weights: Tensor, place: Tensor) -> tuple[Tensor, Tensor]:
+        """Normal (F, 3) of a bent limb, as long as the sine of its bend, and the axis (3,) that it lies on."""
+        joint, axis = hinge
+        middle = self.centre[joint]
+        own = next((weight for j, _, weight, _ in self.steps if j == joint), None)
+        if own is None:
+            return torch.zeros_like(place), points.new_tensor(axis)
+        weight = weights * points.new_tensor(own)
+        total = weight.sum(1, keepdim=True)
+        end = (weight[..., None] * points).sum(1) / total.clamp_min(1e-12)
+        first, second = points[:, middle] - place, end - points[:, middle]
+        unit = torch.nn.functional.normalize
+        normal = torch.linalg.cross(unit(first, dim=-1), unit(second, dim=-1), dim=-1)
+        seen = (weights[:, middle] > 0) & (total.squeeze(1) > 0)
+        return normal * seen[:, None], points.new_tensor(axis)
+
+    def _expected(self, rest: PointRest) -> tuple[Tensor, Tensor]:
+        """Points (i, J, P, 3) about each joint in its own axes, and turns, where all joints are as expected."""
+        model = self.model
+        count = len(rest.local)
+        relative = model.mean.expand(count, -1, 3, 3)
+        from soma_core.inversion.problem import Pose
+
+        pose = Pose.begin(relative, rest.offsets.new_zeros(count, 3))
+        turns, places = model.solver.walk_public(pose, rest.offsets)
+        points = model.points(rest, turns, places)
+        away = points[:, None] - places[:, :, None]
+        return (turns[:, :, None].mT @ away[..., None]).squeeze(-1), turns
+
+    def _nearest(self, covariance: Tensor) -> Tensor:
+        if not self.warp:
+            return rotation_from_covariance(covariance)
+        from soma_core.kernels.nearest_rotation_wp import nearest_rotation
+
+        return nearest_rotation(covariance)

@@ -1,0 +1,133 @@
+"""Pose from points: joints, keypoints or markers to the rig's rotations (paper, section 3.6, of few points)."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from soma_core._derived import Derived, own_precision
+from soma_core._inputs import check_bone_scale, check_choice
+from soma_core.errors import InputError
+from soma_core.inversion._inputs import check_weights, refuse_transforms
+from soma_core.inversion.point_fit import PointFit, PointResult
+from soma_core.inversion.point_model import PointModel
+from soma_core.inversion.point_priors import JointPrior
+from soma_core.inversion.point_start import PointStart
+from soma_core.inversion.result import InversionResult
+from soma_core.layer import Kernels, SomaLayer
+from soma_core.points.places import PointPlaces
+from soma_core.points.point_set import PointSet, load_point_set
+from soma_core.skeleton.identity import Identity
+
+__all__ = ["PointInversion", "PointResult"]
+
+class PointInversion(Derived):
+    """Recovers the rig's rotations from named points; keeps no state between calls.
+
+    The solver is that of :class:`PoseInversion`: points are a cloud of few. What they leave open is left to
+    what is known of a person's joints, weighed against the points by their noise, which is estimated from what
+    the fit leaves: exact points are met exactly, noisy ones are not followed into impossible poses.
+
+    Args:
+        layer: makes identities and poses them.
+        points: a point set, its name (``soma points list``) or its file.
+        prior: what is known of the joints.
+        noise: standard deviation of a coordinate [m]; None estimates one for all frames of a call.
+        iterations: largest number of steps of each look.
+        kernels: ``torch`` (the reference), ``warp`` or ``auto``.
+
+    Raises:
+        InputError: an unknown point set, or one that this layer's mesh does not have.
+    """
+
+    def __init__(
+        self,
+        layer: SomaLayer,
+        points: PointSet | Path | str = "soma77",
+        *,
+        prior: JointPrior | None = None,
+        noise: float | None = None,
+        iterations: int = 20,
+        kernels: Kernels = "auto",
+    ) -> None:
+        super().__init__(locals(), layer.device, layer.dtype)
+        check_choice("kernels", kernels, ("auto", "torch", "warp"))
+        if noise is not None and not 0 < noise < torch.inf:
+            raise InputError(
+                "noise", got=noise, expected="a length above zero [m]", fix="Leave it out to have it estimated."
+            )
+        self.layer, self.points = layer, load_point_set(points)
+        self.prior, self.noise, self.iterations, self.kernels = prior or JointPrior(), noise, iterations, kernels
+        self._build(self.device, self.dtype)
+
+    def _build(self, device: torch.device, dtype: torch.dtype) -> None:
+        layer = self.layer.to(device, dtype)
+        self.device, self.dtype = device, dtype
+        places = PointPlaces(self.points, layer.mesh, layer.rig, dtype=dtype, device=device)
+        warp = self.kernels != "torch"
+        self.model = PointModel(layer, places, self.prior, warp=warp)
+        self.start = PointStart(self.model, self.prior.hinges(layer.rig.joint_names), warp=warp)
+
+    @own_precision
+    def forward(
+        self,
+        points: Tensor,
+        identity: Identity,
+        *,
+        weights: Tensor | None = None,
+        bone_scale: Tensor | None = None,
+        initial: InversionResult | None = None,
+    ) -> PointResult:
+        """Fit every frame.
+
+        Args:
+            points: (F, P, 3) [m], +Y up, in the order of the point set; NaN where a point is not known.
+            identity: batch of 1, shared by all frames, or of F.
+            weights: (P,) or (F, P), relative inverse variances such as a detector's confidence; 0 leaves out.
+            bone_scale: (1 or F, J - 1) known factors of the bone vectors, as in ``SomaLayer.pose``.
+            initial: an earlier result for these frames, to begin from.
+
+        Raises:
+            InputError: a wrong shape, a negative weight, points in another unit than they should be.
+        """
+        refuse_transforms()
+        layer = self.layer
+        if (layer.device, layer.dtype) != (self.device, self.dtype):
+            self._build(layer.device, layer.dtype)
+        layer.check_identity(identity)
+        points = self._checked(points)
+        count = len(points)
+        weights = check_weights(weights, points.new_ones(points.shape[1]), count)
+        bone_scale = check_bone_scale(bone_scale, count, len(layer.joint_names), layer.dtype, layer.device)
+        with torch.no_grad():
+            known = torch.isfinite(points).all(-1)
+            if not bool(known.all()):
+                weights = weights * known
+            clean = torch.where(known[..., None], points, 0.0)
+            fit = PointFit(
+                self.model, self.start, clean, weights, identity, bone_scale, noise=self.noise,
+                iterations=self.iterations,
+            )  # fmt: skip
+            fit.begin(initial)
+            fit.run()
+            return fit.result(known)
+
+    if TYPE_CHECKING:  # torch says that a module returns anything
+        __call__ = forward
+
+    def _checked(self, points: object) -> Tensor:
+        if not isinstance(points, Tensor) or not points.is_floating_point():
+            raise InputError(
+                "points", got=points.dtype if isinstance(points, Tensor) else type(points).__name__,
+                expected="a floating torch.Tensor", fix="Wrap it: torch.as_tensor(points).",
+            )  # fmt: skip
+        wanted = len(self.points)
+        if points.ndim != 3 or tuple(points.shape[1:]) != (wanted, 3):
+            raise InputError(
+                "points", got=tuple(points.shape), expected=f"(frames, {wanted}, 3) of {self.points.name}",
+                fix="Order them as soma points show lists them, or take another point set.",
+            )  # fmt: skip
+        return points.to(self.layer.device, self.layer.dtype)
