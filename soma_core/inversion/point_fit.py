@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -21,17 +22,23 @@ __all__ = ["PointFit", "PointResult"]
 _CHUNK = 2048
 """Frames fitted at a time."""
 
-_FIRST_NOISE, _LEAST_NOISE, _MOST_NOISE = 5e-3, 5e-5, 0.2
-"""Noise of a coordinate [m]: where its estimate begins, and its bounds."""
+_FIRST_NOISE, _LEAST_NOISE, _MOST_NOISE = 3e-4, 5e-5, 0.2
+"""Noise of a coordinate [m]: what it is taken for while it is estimated, so that points have their way; bounds."""
 
-_EXACT = 4.0
-"""Noise below so many times the least is none: the points are then met without regard to what is expected."""
+_UNKNOWN_NOISE = 5e-3
+"""Taken where nothing is left to tell the noise by [m]."""
 
-_SETTLED, _LOOKS = 1.5, 5
-"""The estimate rests when it changes by less than this factor; it is made at most so many times."""
+_SAMPLED, _COUNTED = 128, 8
+"""Frames that tell the noise, and those of them that tell how many degrees of freedom the points take up."""
 
-_SAMPLED = 32
-"""Frames that tell how many degrees of freedom the points take up."""
+_LEAST_CLAIM = 5e-4
+"""No angle is claimed to be surer than so much noise of a coordinate would let it be [m]."""
+
+_STILL = 0.02
+"""A frame rests when a step changes the root mean square error by less than this share of the noise."""
+
+_ROUNDING = 1e-6
+"""Relative to the matrix of the points: what is less is not told from nothing."""
 
 _FEWEST = 3
 """A frame with fewer known points is not fitted."""
@@ -137,19 +144,30 @@ class PointFit:
         self.pose = Pose.begin(relative, hips)
 
     def run(self) -> None:
-        """Fit, with a look at the noise, and at what skin does, until both rest."""
-        corrections = _CORRECTIONS if self.model.corrected else 0
-        for look in range(_LOOKS):
-            self._solve(self.noise)
-            before, self.noise = self.noise, self._estimate() if self.given is None else self.given
-            if look < corrections:
-                self._correct()
-            elif max(before, self.noise) <= _SETTLED * min(before, self.noise):
-                break
-        if self.given is None and self.noise < _EXACT * _LEAST_NOISE:
-            self._solve(_LEAST_NOISE / 10)
-        elif self.noise != before:
-            self._solve(self.noise)
+        """Fit, look at the noise, and at what twist joints and correctives do, and fit again."""
+        if self.given is None:
+            self.noise = self._sampled()._estimate()
+        for _ in range(_CORRECTIONS if self.model.corrected else 0):
+            self._solve(max(self.noise, _FIRST_NOISE))
+            self._correct()
+        if self.model.corrected and self.given is None:
+            self.noise = self._estimate()
+        self._solve(max(self.noise, _FIRST_NOISE))
+        if self.noise < _FIRST_NOISE:
+            self._solve(0.1 * _LEAST_NOISE)
+
+    def _sampled(self) -> PointFit:
+        """A fit of some of the frames, evenly spaced, in which points have their way."""
+        some = torch.nonzero(self.valid).flatten()
+        some = some[torch.linspace(0, len(some) - 1, min(len(some), _SAMPLED)).round().long()]
+        twin = copy.copy(self)
+        for name in ("weights", "every", "valid", "origin", "points", "shift"):
+            value = getattr(self, name)
+            setattr(twin, name, value if len(value) == 1 < len(self.valid) else value[some])
+        twin.rest, twin.pose = self._rest_of(some), self.pose.part(some)
+        for noise in (_FIRST_NOISE, _LEAST_NOISE):
+            twin._solve(noise)
+        return twin
 
     def _solve(self, noise: float) -> None:
         """Steps of all frames under a noise [m]."""
@@ -159,44 +177,43 @@ class PointFit:
             target = self.model.target(one.rest, one.points, one.weights)
             done.append(
                 self.model.solver(
-                    target, moments, one.pose, iterations=self.iterations, tolerance=0.01 * min(noise, 1e-3)
+                    target, moments, one.pose, iterations=self.iterations, tolerance=_STILL * noise
                 )
             )
         self.pose = Pose(**{name: torch.cat([vars(one)[name] for one in done]) for name in vars(self.pose)})
 
     def _misses(self, one: _Chunk) -> Tensor:
         """What points of a chunk miss, (f, P, 3) [m]."""
-        return self.model.points(one.rest, *self.model.solver.walk(one.pose, one.rest)) - one.points
+        return self.model.points(one.rest, *self.model.walk(one.pose, one.rest)) - one.points
 
     def _estimate(self) -> float:
         """Noise of a coordinate [m], from what is left beside the freedom that the points take up."""
         energy = torch.cat([
             (one.weights[..., None] * self._misses(one).square()).sum((1, 2)) for one in self.chunks()
         ])[self.valid]  # fmt: skip
-        some = torch.nonzero(self.valid).flatten()
-        if not len(some):
-            return self.noise
-        some = some[torch.linspace(0, len(some) - 1, min(len(some), _SAMPLED)).round().long()]
+        if not len(energy):
+            return _UNKNOWN_NOISE
+        some = torch.nonzero(self.valid).flatten()[:: max(1, len(energy) // _COUNTED)]
         seen = 3 * (self.every > 0)[self.valid].sum(1).to(energy).mean()
         spare = seen - self._taken(some)
         if spare < 1:  # the points just determine the pose: nothing is left to tell the noise by
-            return _FIRST_NOISE
+            return _UNKNOWN_NOISE
         return float((energy.mean() / spare).sqrt().clamp(_LEAST_NOISE, _MOST_NOISE))
 
     def _matrix(self, some: Tensor, noise: float) -> Tensor:
         """Gauss-Newton matrix (f, 3 n + 3, 3 n + 3) of some frames, float64."""
         rest, pose = self._rest_of(some), self.pose.part(some)
-        turns, places = self.model.solver.walk(pose, rest)
+        turns, places = self.model.walk(pose, rest)
         weights = self.weights if len(self.weights) == 1 else self.weights[some]
         moments = self.model.moments(rest, weights, noise**2)
         matrix, _ = self.model.solver.normal_equations(turns, places, moments)
         return matrix.flatten(3, 4).flatten(1, 2).double()
 
     def _taken(self, some: Tensor) -> Tensor:
-        """Mean degrees of freedom that the points take up in some frames."""
-        whole = self._matrix(some, self.noise)
+        """Mean degrees of freedom that the points take up in some frames, while they have their way."""
+        whole = self._matrix(some, _FIRST_NOISE)
         diagonal = whole.diagonal(dim1=-2, dim2=-1)
-        diagonal += 1e-9 * diagonal.mean(1, keepdim=True)
+        diagonal += _ROUNDING * diagonal + _ROUNDING * diagonal.mean(1, keepdim=True)
         factor, _ = torch.linalg.cholesky_ex(whole)
         share = torch.cholesky_solve(self._matrix(some, 0.0), factor)
         return share.diagonal(dim1=-2, dim2=-1).sum(1).mean()
@@ -216,11 +233,11 @@ class PointFit:
     def _angle_std(self) -> Tensor:
         """Standard deviation (F, J - 1) [degrees] of each joint's own turn."""
         model = self.model
-        every = model.spread.expand(len(self.points), -1).clone()
+        every, noise = model.spread.repeat(len(self.points), 1), max(self.noise, _LEAST_CLAIM)
         for one in self.chunks():
-            moments = model.moments(one.rest, one.weights, self.noise**2)
+            moments = model.moments(one.rest, one.weights, noise**2)
             variance = model.variances(moments, one.pose)
-            every[one.frames, model.solver.variables] = (self.noise * variance.clamp_min(0).sqrt()).rad2deg()
+            every[one.frames, model.solver.variables] = (noise * variance.clamp_min(0).sqrt()).rad2deg()
         return every[:, 1:]
 
     def result(self, known: Tensor) -> PointResult:
@@ -238,7 +255,7 @@ class PointFit:
             vertex_error=error.masked_fill(~(known & valid[:, None]), torch.nan),
             valid=valid,
             determined=surely & valid[:, None],
-            converged=(self.pose.last_change < 0.1 * self.noise) & valid,
+            converged=(self.pose.last_change < 5 * _STILL * max(self.noise, _FIRST_NOISE)) & valid,
             iterations=self.pose.accepted,
             residual=residual.masked_fill(~valid, torch.nan),
             angle_std=std.masked_fill(~valid[:, None], torch.nan),

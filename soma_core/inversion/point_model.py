@@ -210,6 +210,14 @@ class PointModel(torch.nn.Module):
         own = torch.stack(columns, 1).diagonal(dim1=-2, dim2=-1)
         return own.unflatten(1, (-1, 3)).sum(-1)[:, :-1]
 
+    def walk(self, pose: Pose, rest: PointRest) -> tuple[Tensor, Tensor]:
+        """Turns (F, J, 3, 3) and places (F, J, 3) [m] of all joints."""
+        kernels = self.solver.kernels
+        if kernels is None:
+            return self.solver.walk_public(pose, rest.offsets)
+        none = rest.offsets.new_zeros(1, 16 * len(self.prior))
+        return kernels.walked(kernels.constants(none, rest.offsets), pose.relative, pose.translation)
+
     def points(self, rest: PointRest, turns: Tensor, places: Tensor) -> Tensor:
         """Points (F, P, 3) [m] at turns (F, J, 3, 3) and places (F, J, 3) of all joints."""
         moved = torch.cat((turns, places[..., None]), -1)[:, self.weighted]

@@ -8,6 +8,7 @@ from torch import Tensor
 
 from soma_core.geometry.kabsch import rotation_from_covariance
 from soma_core.inversion.point_model import PointModel, PointRest
+from soma_core.inversion.problem import Pose
 
 __all__ = ["PointStart"]
 
@@ -78,42 +79,34 @@ class PointStart(torch.nn.Module):
         """
         model, count = self.model, len(points)
         mean = model.mean
-        at_rest, turns_rest = self._expected(rest)
+        at_rest = self._expected(rest)
         weights = weights.expand(count, -1)
         turns = torch.eye(3, dtype=points.dtype, device=points.device).repeat(count, model.solver.joint_count, 1, 1)
         places = points.new_zeros(count, model.solver.joint_count, 3)
-        known = {int(j): (turn, weight, hinge) for j, turn, weight, hinge in self.steps}
         hips = points.new_zeros(count, 3)
-        for joint in range(1, model.solver.joint_count):
-            above = max(int(model.structure.parents[joint]), 0)
+        for joint, above, own, hinge in self.steps:
             expected = turns[:, above] @ mean[joint]
-            if joint > 1:
-                offset = rest.offsets[:, joint]
-                place = places[:, above] + (turns[:, above] @ offset[..., None]).squeeze(-1)
-                if self.centre[joint] >= 0:
-                    seen = weights[:, self.centre[joint], None] > 0
-                    place = torch.where(seen, points[:, self.centre[joint]], place)
-                places[:, joint] = place
-            if joint not in known:
-                turns[:, joint] = expected
-                continue
-            _, own, hinge = known[joint]
             weight = weights * points.new_tensor(own)
             arms = at_rest[:, joint]  # (i, P, 3) in the joint's axes
             if joint == 1:
                 total = weight.sum(1, keepdim=True).clamp_min(1e-12)
                 middle = (weight[..., None] * points).sum(1) / total
                 inner = (weight[..., None] * arms).sum(1) / total
-                turns[:, 1] = self._turn(weight, points - middle[:, None], arms - inner[:, None], expected, None)
+                aims = points - middle[:, None]
+                turns[:, 1] = self._turn(weight, aims, arms - inner[:, None], expected, None)
                 hips = middle - (turns[:, 1] @ inner[..., None]).squeeze(-1)
                 places[:, 1] = hips
                 continue
-            bend = None if hinge is None else self._bend(hinge, points, weights, places[:, joint])
-            turns[:, joint] = self._turn(weight, points - places[:, joint, None], arms, expected, bend)
-        parents = model.parents
-        relative = turns[:, parents].mT @ turns
-        relative[:, 0] = turns[:, 0]
-        relative[:, 1] = turns[:, 1]
+            place = places[:, above] + (turns[:, above] @ rest.offsets[:, joint, :, None]).squeeze(-1)
+            if self.centre[joint] >= 0:
+                seen = weights[:, self.centre[joint], None] > 0
+                place = torch.where(seen, points[:, self.centre[joint]], place)
+            places[:, joint] = place
+            bend = None if hinge is None else self._bend(hinge, points, weights, place)
+            turns[:, joint] = self._turn(weight, points - place[:, None], arms, expected, bend)
+        variables = model.solver.variables
+        relative = mean.repeat(count, 1, 1, 1)
+        relative[:, variables] = turns[:, model.parents[variables]].mT @ turns[:, variables]
         return relative, hips, self._scale(points, weights, at_rest)
 
     def _scale(self, points: Tensor, weights: Tensor, at_rest: Tensor) -> Tensor:
@@ -162,18 +155,16 @@ class PointStart(torch.nn.Module):
         seen = (weights[:, middle] > 0) & (total.squeeze(1) > 0)
         return normal * seen[:, None], points.new_tensor(axis)
 
-    def _expected(self, rest: PointRest) -> tuple[Tensor, Tensor]:
-        """Points (i, J, P, 3) about each joint in its own axes, and turns, where all joints are as expected."""
+    def _expected(self, rest: PointRest) -> Tensor:
+        """Points (i, J, P, 3) about each joint in its own axes, where all joints are as expected."""
         model = self.model
         count = len(rest.local)
         relative = model.mean.expand(count, -1, 3, 3)
-        from soma_core.inversion.problem import Pose
-
         pose = Pose.begin(relative, rest.offsets.new_zeros(count, 3))
         turns, places = model.solver.walk_public(pose, rest.offsets)
         points = model.points(rest, turns, places)
         away = points[:, None] - places[:, :, None]
-        return (turns[:, :, None].mT @ away[..., None]).squeeze(-1), turns
+        return (turns[:, :, None].mT @ away[..., None]).squeeze(-1)
 
     def _nearest(self, covariance: Tensor) -> Tensor:
         if not self.warp:
