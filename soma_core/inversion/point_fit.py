@@ -154,7 +154,7 @@ class PointFit:
             self.noise = self._estimate()
         self._solve(max(self.noise, _FIRST_NOISE))
         if self.noise < _FIRST_NOISE:
-            self._solve(0.1 * _LEAST_NOISE)
+            self._solve(_FIRST_NOISE, held=True)
 
     def _sampled(self) -> PointFit:
         """A fit of some of the frames, evenly spaced, in which points have their way."""
@@ -165,21 +165,23 @@ class PointFit:
             value = getattr(self, name)
             setattr(twin, name, value if len(value) == 1 < len(self.valid) else value[some])
         twin.rest, twin.pose = self._rest_of(some), self.pose.part(some)
-        for noise in (_FIRST_NOISE, _LEAST_NOISE):
-            twin._solve(noise)
+        for held in (False, True):
+            twin._solve(_FIRST_NOISE, held=held)
         return twin
 
-    def _solve(self, noise: float) -> None:
-        """Steps of all frames under a noise [m]."""
-        done = []
+    def _solve(self, noise: float, *, held: bool = False) -> None:
+        """Steps of all frames under a noise [m].
+
+        With `held` what the points leave open stays as it is, and nothing pulls at what they tell.
+        """
+        done, still = [], _STILL * noise * (0.1 if held else 1.0)
         for one in self.chunks():
-            moments = self.model.moments(one.rest, one.weights, noise**2)
+            moments = self.model.moments(one.rest, one.weights, noise**2, held=held)
             target = self.model.target(one.rest, one.points, one.weights)
-            done.append(
-                self.model.solver(
-                    target, moments, one.pose, iterations=self.iterations, tolerance=_STILL * noise
-                )
-            )
+            if held:
+                target = self.model.held(target, self.model.walk(one.pose, one.rest)[0], noise**2)
+            solver, steps = self.model.solver, self.iterations
+            done.append(solver(target, moments, one.pose, iterations=steps, tolerance=still))
         self.pose = Pose(**{name: torch.cat([vars(one)[name] for one in done]) for name in vars(self.pose)})
 
     def _misses(self, one: _Chunk) -> Tensor:

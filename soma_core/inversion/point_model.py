@@ -27,6 +27,9 @@ from soma_core.skeleton.identity import Identity
 
 __all__ = ["PointModel", "PointRest"]
 
+_HELD = 5.0
+"""Pull of turns that are held, as a prior has it [1/rad^2]."""
+
 _LEAST_SKIN = 0.02
 """Smaller skin weights of a point are left out of the solver; its correction has them."""
 
@@ -63,6 +66,7 @@ class PointModel(torch.nn.Module):
     """
 
     prior: Tensor
+    hold: Tensor
     mean: Tensor
     spread: Tensor
 
@@ -96,7 +100,7 @@ class PointModel(torch.nn.Module):
         keep = {
             "prior": moments, "mean": self.prior_mean,
             "parents": np.maximum(parents, 0), "weighted": structure.joints,
-            "spread": _spread(blocks),
+            "spread": _spread(blocks), "hold": _HELD * _hold(structure.pairs),
         }  # fmt: skip
         for key, array in keep.items():
             tensor = torch.as_tensor(np.ascontiguousarray(array), device=layer.device)
@@ -168,17 +172,23 @@ class PointModel(torch.nn.Module):
             add(at, self.skin_weight[:, None] * torch.nn.functional.pad(point, (0, 1), value=1.0))
         return PointRest(local=local, offsets=offsets)
 
-    def moments(self, rest: PointRest, weights: Tensor, prior: Tensor | float) -> RestMoments:
-        """``N`` of points with weights (1 or F, P), and of the prior times `prior` (1 or F) [m^2]."""
+    def moments(self, rest: PointRest, weights: Tensor, prior: float, *, held: bool = False) -> RestMoments:
+        """``N`` of points with weights (1 or F, P), and of the prior times `prior` [m^2].
+
+        With `held` every joint's turn in the world is pulled to one of the target's instead.
+        """
         weighed = weights[:, :, None, None] * rest.local
         first, second = weighed[:, :, self.first], rest.local[:, :, self.second]
         pairs = torch.einsum("ipka,ipkb->ikab", first, second.expand(len(first), -1, -1, -1))
-        prior = torch.as_tensor(prior, dtype=pairs.dtype, device=pairs.device).view(-1, 1, 1, 1)
-        pairs = pairs + prior * self.prior
+        pairs = pairs + prior * (self.hold if held else self.prior)
         own = pairs.new_zeros(len(pairs), len(self.joints), 4, 4)
         own[:, 0, 3, 3] = weights.sum(1)
         empty = pairs.new_empty(len(pairs), 0)
         return RestMoments(local=empty, weight=empty, own=own, second=pairs, offsets=rest.offsets)
+
+    def held(self, target: Tensor, turns: Tensor, prior: float) -> Tensor:
+        """``R`` (F, T, 3, 4) that also pulls to world turns (F, J, 3, 3)."""
+        return target + _HELD * prior * torch.nn.functional.pad(turns[:, self.weighted], (0, 1))
 
     def target(self, rest: PointRest, points: Tensor, weights: Tensor) -> Tensor:
         """``R`` (F, T, 3, 4) of targets (F, P, 3) [m], finite, under weights (1 or F, P)."""
@@ -244,6 +254,11 @@ def _above(carried: np.ndarray, parents: np.ndarray) -> np.ndarray:
             found[parents[joint]] = True
     found[0] = False
     return np.flatnonzero(found)
+
+
+def _hold(pairs: np.ndarray) -> np.ndarray:
+    """Moments (p, 4, 4) that pull every joint's turn in the world."""
+    return (pairs[:, :1] == pairs[:, 1:])[..., None] * np.diag([1.0, 1.0, 1.0, 0.0])
 
 
 def _spread(blocks: np.ndarray) -> np.ndarray:

@@ -34,22 +34,26 @@ def _joints() -> dict[str, JointRange]:
     """Pattern -> range of the left side and the middle."""
     x, y, z = (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)
     return {
-        r"Spine\d|Chest": JointRange(axis=y, spread=(10, 12)),
-        r"Neck\d": JointRange(axis=y, spread=(12, 12)),
-        r"Head": JointRange(axis=y, spread=(20, 18)),
-        r"Jaw|.*Eye": JointRange(axis=x, spread=(6, 6)),
-        r"LeftShoulder": JointRange(axis=x, spread=(10, 12)),
-        r"LeftArm": JointRange(rest=(0, 0, -50), axis=x, spread=(35, 45)),
-        r"LeftForeArm": JointRange(rest=(0, -25, 0), axis=(0, -1, 0), spread=(45, 6), flexes=True),
-        r"LeftHand": JointRange(axis=x, spread=(30, 25)),
+        r"Spine1": JointRange(rest=(5, 0, 0), axis=y, spread=(6, 10)),
+        r"Spine2": JointRange(rest=(-3, 0, 0), axis=y, spread=(6, 8)),
+        r"Chest": JointRange(rest=(13, 0, 0), axis=y, spread=(8, 9)),
+        r"Neck1": JointRange(axis=y, spread=(10, 10)),
+        r"Neck2": JointRange(rest=(-4, 0, 0), axis=y, spread=(10, 6)),
+        r"Head": JointRange(rest=(-9, 0, 0), axis=y, spread=(15, 10)),
+        r"Jaw": JointRange(axis=x, spread=(6, 3)),
+        r"LeftEye": JointRange(rest=(-11, -4, 0), axis=x, spread=(6, 6)),
+        r"LeftShoulder": JointRange(rest=(14, -8, -6), axis=x, spread=(6, 10)),
+        r"LeftArm": JointRange(rest=(0, -12, -55), axis=x, spread=(20, 40)),
+        r"LeftForeArm": JointRange(rest=(0, -45, 0), axis=(0, -1, 0), spread=(40, 4), flexes=True),
+        r"LeftHand": JointRange(rest=(-8, -7, 4), axis=x, spread=(30, 20)),
         r"LeftHand(Index|Middle|Ring|Pinky)1": JointRange(axis=z, spread=(4, 4)),
         r"LeftHand(Index|Middle|Ring|Pinky)2": JointRange(axis=z, spread=(30, 8)),
         r"LeftHand(Index|Middle|Ring|Pinky)[34]": JointRange(axis=z, spread=(30, 4)),
         r"LeftHandThumb\d": JointRange(axis=x, spread=(15, 20)),
-        r"LeftLeg": JointRange(axis=y, spread=(20, 35)),
-        r"LeftShin": JointRange(rest=(15, 0, 0), axis=x, spread=(40, 5), flexes=True),
-        r"LeftFoot": JointRange(axis=y, spread=(10, 20)),
-        r"LeftToeBase": JointRange(axis=x, spread=(15, 4)),
+        r"LeftLeg": JointRange(rest=(-16, 6, 6), axis=y, spread=(12, 30)),
+        r"LeftShin": JointRange(rest=(32, 0, 0), axis=x, spread=(35, 4), flexes=True),
+        r"LeftFoot": JointRange(rest=(-10, 3, -4), axis=y, spread=(10, 15)),
+        r"LeftToeBase": JointRange(rest=(-4, -2, 2), axis=x, spread=(12, 3)),
     }
 
 
