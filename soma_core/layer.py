@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Literal, get_args
 import torch
 from torch import Tensor
 
-from soma_core._derived import Derived, own_precision
+from soma_core._derived import own_precision
 from soma_core._inputs import (
     check_bone_scale,
     check_choice,
@@ -32,6 +32,7 @@ from soma_core.errors import InputError
 from soma_core.geometry.rotations import axis_angle_to_matrix
 from soma_core.geometry.torch_func import untracked
 from soma_core.plugin.registry import Registry, default_registry
+from soma_core.points.part import PartialBodies
 from soma_core.rig import load_canonical
 from soma_core.rig.mesh import CanonicalMesh, Lod
 from soma_core.rig.skeleton import Rig
@@ -46,7 +47,7 @@ _CHUNK = 32
 """Bodies evaluated at a time where nothing is kept for a gradient."""
 
 
-class SomaLayer(Derived):
+class SomaLayer(PartialBodies):
     """Any identity backend, animated on the canonical rig.
 
     ``identity`` and ``pose`` are functions of their arguments: the layer keeps no identity and no cache,
@@ -213,6 +214,7 @@ class SomaLayer(Derived):
         *,
         absolute: bool = False,
         bone_scale: Tensor | None = None,
+        vertices: Tensor | None = None,
     ) -> Posed:
         """Pose identities (paper, section 3.5.1).
 
@@ -225,11 +227,15 @@ class SomaLayer(Derived):
             absolute: `rotations` are local rotations of the rig's own axes instead.
             bone_scale: (batch, J - 1) or (1, J - 1) factors of the bone that leads to each joint, applied
                 when posing; the skin is not refitted. That of the Hips has no effect.
+            vertices: (u,) ids of those that are wanted; :meth:`subset` prepares them for many calls.
 
         Raises:
             InputError: a wrong shape, dtype or device, a NaN, a matrix that is no rotation, a bone scale
                 that is not positive.
         """
+        if vertices is not None:
+            given = identity, rotations, translation
+            return self.subset(vertices).pose(*given, absolute=absolute, bone_scale=bone_scale)
         return self.pose_checked(self._body(identity, rotations, translation, bone_scale), absolute=absolute)
 
     @own_precision

@@ -64,7 +64,7 @@ RANKS = [
     {"kernels", "_inputs", "_derived"},
     {"rig", "topology", "skeleton", "animation", "correctives"},
     {"backends", "io"},
-    {"compiled"},
+    {"compiled", "points"},
     {"layer"},
     {"inversion"},
     {"native", "registration"},

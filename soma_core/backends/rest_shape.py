@@ -120,8 +120,8 @@ class ComposedRestShape(torch.nn.Module):
         else:
             stacked = torch.addmm(self.template, self.basis, rows.T)
         size = 3 * self.vertex_count
-        points = stacked[:size].unflatten(0, (3, self.vertex_count))
-        moments = stacked[size:].unflatten(0, (4 * self.fit.joint_count, 3))
+        points, moments = stacked[:size].unflatten(0, (3, self.vertex_count)), stacked[size:]
+        offsets = None
         if self.exact is not None:
             offsets = self.exact.evaluate(coefficients)
             inplace = points.device.type != "cpu" and untracked(
@@ -129,11 +129,33 @@ class ComposedRestShape(torch.nn.Module):
             )  # spares a copy of all bodies
             add = points.index_add_ if inplace else points.index_add
             points = add(1, self.offset_place, offsets[self.offset_chosen].transpose(0, 1))
-            moments = moments + (self.offset_moments @ offsets.flatten(1)).view(*moments.shape)
-        moments = moments.unflatten(0, (self.fit.joint_count, 4)).permute(3, 0, 1, 2)
         if self.reduction is not None:
             points = self.reduction.from_needed(points.permute(2, 1, 0)).permute(2, 1, 0)
-        return points, self.fit.from_moments(moments)
+        return points, self._fitted(moments, offsets)
+
+    def some(self, params: Mapping[str, Tensor], ids: Tensor) -> tuple[Tensor, Tensor]:
+        """The same for some of the vertices, as planes (3, u, B), at the cost of these and of the skeleton."""
+        if self.reduction is not None and len(ids):
+            points, fitted = self(params)
+            return points[:, ids], fitted
+        coefficients, size = self.coefficients(params), 3 * self.vertex_count
+        rows = torch.cat([ids + axis * self.vertex_count for axis in range(3)])
+        planes = torch.addmm(self.template[rows], self.basis[rows], coefficients.T).unflatten(0, (3, len(ids)))
+        moments = torch.addmm(self.template[size:], self.basis[size:], coefficients.T)
+        offsets = None if self.exact is None else self.exact.evaluate(coefficients)
+        if offsets is not None and len(ids):
+            place = ids.new_full((self.vertex_count,), -1)
+            place[self.offset_place] = self.offset_chosen
+            moved = torch.nonzero(place[ids] >= 0).squeeze(1)
+            planes = planes.index_add(1, moved, offsets[place[ids[moved]]].transpose(0, 1))
+        return planes, self._fitted(moments, offsets)
+
+    def _fitted(self, moments: Tensor, offsets: Tensor | None) -> Tensor:
+        """Transforms (B, J, 4, 4) from moments (12 J, B) of the linear part, and offsets (e, 3, B)."""
+        moments = moments.unflatten(0, (4 * self.fit.joint_count, 3))
+        if offsets is not None:
+            moments = moments + (self.offset_moments @ offsets.flatten(1)).view(*moments.shape)
+        return self.fit.from_moments(moments.unflatten(0, (self.fit.joint_count, 4)).permute(3, 0, 1, 2))
 
     def coefficients(self, params: Mapping[str, Tensor]) -> Tensor:
         """What the plugin makes of the parameters, (B, k)."""
