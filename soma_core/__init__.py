@@ -20,6 +20,9 @@ if TYPE_CHECKING:
     from soma_core.inversion.diagnosis import diagnose_fit
     from soma_core.inversion.fit import PoseInversion
     from soma_core.inversion.identity import IdentityFit, fit_identity
+    from soma_core.inversion.point_fit import PointResult
+    from soma_core.inversion.point_priors import JointPrior, JointRange
+    from soma_core.inversion.points import PointInversion
     from soma_core.inversion.priors import HINGES, PosePriors
     from soma_core.inversion.result import InversionResult
     from soma_core.io.amass import SmplMotion, write_amass
@@ -41,6 +44,7 @@ if TYPE_CHECKING:
     from soma_core.paths import assets_dir
     from soma_core.plugin.errors import BackendError
     from soma_core.plugin.registry import default_registry
+    from soma_core.points.point_set import Point, PointSet, load_point_set
     from soma_core.rig.canonical import load_canonical
     from soma_core.rig.mesh import CanonicalMesh
     from soma_core.rig.neutral import ShapeSpace, load_shape_space
@@ -59,11 +63,17 @@ __all__ = [
     "IdentityFit",
     "InputError",
     "InversionResult",
+    "JointPrior",
+    "JointRange",
     "Motion",
     "NativeFit",
     "NativeMotion",
     "NativeTransfer",
     "ParameterFit",
+    "Point",
+    "PointInversion",
+    "PointResult",
+    "PointSet",
     "PoseInversion",
     "PosePriors",
     "Posed",
@@ -82,6 +92,7 @@ __all__ = [
     "diagnose_fit",
     "fit_identity",
     "load_canonical",
+    "load_point_set",
     "load_shape_space",
     "open_vertex_sequence",
     "read_amass",
@@ -114,6 +125,11 @@ _HOMES = {
     "soma_core.inversion.diagnosis": ["diagnose_fit"],
     "soma_core.inversion.analytical": ["AnalyticalOptions"],
     "soma_core.inversion.autograd": ["AutogradOptions"],
+    "soma_core.inversion.points": ["PointInversion"],
+    "soma_core.inversion.point_fit": ["PointResult"],
+    "soma_core.inversion.point_priors": ["JointPrior", "JointRange"],
+    # Named points: keypoints, markers, joints of other rigs
+    "soma_core.points.point_set": ["Point", "PointSet", "load_point_set"],
     # To the meshes and poses of other models
     "soma_core.native.fit": ["NativeFit"],
     "soma_core.native.motion": ["NativeMotion"],

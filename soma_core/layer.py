@@ -29,10 +29,9 @@ from soma_core.backends.rest_shape import make_rest_shape
 from soma_core.compiled import CompiledLayer
 from soma_core.correctives.model import find_correctives, load_correctives
 from soma_core.errors import InputError
-from soma_core.geometry.rotations import axis_angle_to_matrix
 from soma_core.geometry.torch_func import untracked
 from soma_core.plugin.registry import Registry, default_registry
-from soma_core.points.part import PartialBodies
+from soma_core.points.part import PartialBodies, as_matrices
 from soma_core.rig import load_canonical
 from soma_core.rig.mesh import CanonicalMesh, Lod
 from soma_core.rig.skeleton import Rig
@@ -153,11 +152,6 @@ class SomaLayer(PartialBodies):
         )
 
     @property
-    def plain(self) -> bool:
-        """Whether :meth:`pose` is linear blend skinning alone, without twist joints and correctives."""
-        return self.posing is self.animation and self.correctives is None
-
-    @property
     def joint_names(self) -> tuple[str, ...]:
         """Names of the user joints, in the order of `rotations`."""
         return self.rig.user_joint_names
@@ -233,10 +227,10 @@ class SomaLayer(PartialBodies):
             InputError: a wrong shape, dtype or device, a NaN, a matrix that is no rotation, a bone scale
                 that is not positive.
         """
+        given = identity, rotations, translation
         if vertices is not None:
-            given = identity, rotations, translation
             return self.subset(vertices).pose(*given, absolute=absolute, bone_scale=bone_scale)
-        return self.pose_checked(self._body(identity, rotations, translation, bone_scale), absolute=absolute)
+        return self.pose_checked(self._body(*given, bone_scale), absolute=absolute)
 
     @own_precision
     def pose_checked(self, body: Body, *, absolute: bool = False) -> Posed:
@@ -244,7 +238,7 @@ class SomaLayer(PartialBodies):
         if self._fusible(*body[:4]):
             assert self.fused is not None
             return self.fused(*body[:3], absolute=absolute, bone_scale=body.bone_scale)
-        body = body._replace(relative=_matrices(body.relative))
+        body = body._replace(relative=as_matrices(body.relative))
         moves = self._offsets(body.identity, body.relative, absolute=absolute)
         return self.posing.pose(*body[:3], absolute=absolute, bone_scale=body.bone_scale, offsets=moves)
 
@@ -283,7 +277,7 @@ class SomaLayer(PartialBodies):
             assert self.fused is not None
             pose, more = self.fused, {"plain": self.animation}
         else:
-            body = body._replace(relative=_matrices(body.relative))
+            body = body._replace(relative=as_matrices(body.relative))
         return pose(*body[:3], absolute=absolute, bone_scale=body.bone_scale, **more)
 
     def _fusible(
@@ -329,7 +323,7 @@ class SomaLayer(PartialBodies):
         shift = check_translation(translation, batch, self.dtype, self.device)
         bone_scale = check_bone_scale(bone_scale, batch, len(self.joint_names), self.dtype, self.device)
         if not self._fusible(identity, relative, shift, bone_scale):
-            relative = _matrices(relative)
+            relative = as_matrices(relative)
         return Body(identity, relative.expand(batch, *relative.shape[1:]), shift, bone_scale)
 
     def check_identity(self, identity: Identity) -> None:
@@ -367,7 +361,7 @@ class SomaLayer(PartialBodies):
             rotations, len(self.joint_names), self.dtype, self.device, validate=self.validate, convert=False
         )
         if self.fused is None:
-            relative = _matrices(relative)
+            relative = as_matrices(relative)
         identities = len(next(iter(batch.values()), relative))
         size = common_batch(identities, len(relative))
         shift = check_translation(translation, size, self.dtype, self.device)
@@ -399,8 +393,3 @@ class SomaLayer(PartialBodies):
 
     if TYPE_CHECKING:  # torch says that a module returns anything
         __call__ = forward
-
-
-def _matrices(rotations: Tensor) -> Tensor:
-    """Matrices (..., 3, 3) from checked rotations of either form, (B, J - 1, 3) or (B, J - 1, 3, 3)."""
-    return axis_angle_to_matrix(rotations) if rotations.ndim == 3 else rotations

@@ -134,13 +134,14 @@ class ComposedRestShape(torch.nn.Module):
         return points, self._fitted(moments, offsets)
 
     def some(self, params: Mapping[str, Tensor], ids: Tensor) -> tuple[Tensor, Tensor]:
-        """The same for some of the vertices, as planes (3, u, B), at the cost of these and of the skeleton."""
+        """The same for some vertices, as planes (3, u, B), at the cost of these and of the skeleton."""
         if self.reduction is not None and len(ids):
             points, fitted = self(params)
             return points[:, ids], fitted
         coefficients, size = self.coefficients(params), 3 * self.vertex_count
         rows = torch.cat([ids + axis * self.vertex_count for axis in range(3)])
-        planes = torch.addmm(self.template[rows], self.basis[rows], coefficients.T).unflatten(0, (3, len(ids)))
+        planes = torch.addmm(self.template[rows], self.basis[rows], coefficients.T)
+        planes = planes.unflatten(0, (3, len(ids)))
         moments = torch.addmm(self.template[size:], self.basis[size:], coefficients.T)
         offsets = None if self.exact is None else self.exact.evaluate(coefficients)
         if offsets is not None and len(ids):

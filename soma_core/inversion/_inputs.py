@@ -73,7 +73,9 @@ def refuse_unit_error(scale: Tensor, name: str = "vertices") -> None:
             raise InputError(
                 name,
                 got=f"bodies {typical:.4g} times the size of their identity",
-                expected="metres" if points else "metres on the canonical topology, or the backend's own unit",
+                expected="metres"
+                if points
+                else "metres on the canonical topology, or the backend's own unit",
                 fix=f"Multiply the {name} by {1 / factor:g}.",
             )
 

@@ -23,7 +23,7 @@ _CHUNK = 2048
 """Frames fitted at a time."""
 
 _FIRST_NOISE, _LEAST_NOISE, _MOST_NOISE = 3e-4, 5e-5, 0.2
-"""Noise of a coordinate [m]: what it is taken for while it is estimated, so that points have their way; bounds."""
+"""Noise of a coordinate [m]: taken while it is estimated, so that points have their way; its bounds."""
 
 _UNKNOWN_NOISE = 5e-3
 """Taken where nothing is left to tell the noise by [m]."""
@@ -54,8 +54,8 @@ _SURE = 0.5
 class PointResult(InversionResult):
     """The pose of every frame, and how well it explains the points.
 
-    ``vertex_error`` is that of the points, (frames, P). ``determined`` says which joints the points tell more of
-    than what is expected of a person anyway; ``angle_std`` of the others is the spread that is expected.
+    ``vertex_error`` is that of the points, (frames, P). ``determined`` says which joints the points tell more
+    of than what is expected of a person anyway; ``angle_std`` of the others is the spread that is expected.
 
     Attributes:
         noise: standard deviation of a coordinate of the points [m], as it was given or found.

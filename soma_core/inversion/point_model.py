@@ -106,7 +106,9 @@ class PointModel(torch.nn.Module):
             tensor = torch.as_tensor(np.ascontiguousarray(array), device=layer.device)
             tensor = tensor.to(layer.dtype) if tensor.is_floating_point() else tensor.long()
             self.register_buffer(key, tensor, persistent=False)
-        self.first, self.second = (torch.as_tensor(side.copy(), device=layer.device) for side in structure.pairs.T)
+        self.first, self.second = (
+            torch.as_tensor(side.copy(), device=layer.device) for side in structure.pairs.T
+        )
         self._build_atoms(row, parents, **kind)
 
     def _influences(self, places: PointPlaces, rig) -> np.ndarray:
@@ -125,9 +127,7 @@ class PointModel(torch.nn.Module):
         """Terms of the points: (point, row, joint or vertex, weight)."""
         places, vertex_weight = self.places, self.skin[0]
         weight = places.joint_weight.double().cpu().numpy()
-        centres = [
-            (p, row[max(int(parents[j]), 1)], j, weight[p, j]) for p, j in np.argwhere(weight)
-        ]
+        centres = [(p, row[max(int(parents[j]), 1)], j, weight[p, j]) for p, j in np.argwhere(weight)]
         reach = [(p, row[int(j)], j) for p, j in np.argwhere(weight) if places.offset[p].any()]
         skin = [
             (p, row[int(t)], u, places.vertex_weight[p, u] * vertex_weight[u, t])
@@ -216,7 +216,9 @@ class PointModel(torch.nn.Module):
         matrix, slope = self.solver.normal_equations(*self.solver.walk(pose, moments), moments)
         solve = damped_inverse(matrix, 0 * mass)
         count = slope.shape[1] * 3
-        columns = [solve(row.view(1, -1, 3).expand_as(slope)).flatten(1) for row in torch.eye(count).to(slope)]
+        columns = [
+            solve(row.view(1, -1, 3).expand_as(slope)).flatten(1) for row in torch.eye(count).to(slope)
+        ]
         own = torch.stack(columns, 1).diagonal(dim1=-2, dim2=-1)
         return own.unflatten(1, (-1, 3)).sum(-1)[:, :-1]
 
@@ -243,7 +245,11 @@ def _skin(places: PointPlaces, rig) -> tuple[np.ndarray, np.ndarray]:
     weights[:, 0] = 0
     weights[weights < _LEAST_SKIN] = 0
     weights /= np.maximum(weights.sum(1, keepdims=True), 1e-12)
-    return weights, (abs(places.vertex_weight) @ weights if len(weights) else np.zeros((len(places.names), rig.joint_count)))
+    return weights, (
+        abs(places.vertex_weight) @ weights
+        if len(weights)
+        else np.zeros((len(places.names), rig.joint_count))
+    )
 
 
 def _above(carried: np.ndarray, parents: np.ndarray) -> np.ndarray:

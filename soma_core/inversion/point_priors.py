@@ -58,7 +58,7 @@ def _joints() -> dict[str, JointRange]:
 
 
 JOINTS: Mapping[str, JointRange] = _joints()
-"""Ranges by a pattern of the joint's name, for the left side and the middle; the right side mirrors the left."""
+"""Ranges by a pattern of the joint's name; the right side mirrors the left."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -21,8 +21,8 @@ _EXPECTED = 0.02
 _BEND = 0.5
 """Weight of the axis that a hinge bends about, beside the bone that leads to it."""
 
-_NEAR = 0.02
-"""A point this close to a joint's centre at rest shows where the joint is [m]."""
+_SLIGHT = 0.4
+"""Sine of a bend that may be noise."""
 
 
 class PointStart(torch.nn.Module):
@@ -70,7 +70,7 @@ class PointStart(torch.nn.Module):
         self.owner = owner
 
     def forward(self, rest: PointRest, points: Tensor, weights: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """T-pose-relative rotations (F, J, 3, 3), Hips positions (F, 3) [m], and sizes (F,) beside the identity.
+        """Rotations (F, J, 3, 3), Hips positions (F, 3) [m], sizes (F,) beside the identity.
 
         Args:
             rest: of one identity, or of one a frame.
@@ -81,7 +81,9 @@ class PointStart(torch.nn.Module):
         mean = model.mean
         at_rest = self._expected(rest)
         weights = weights.expand(count, -1)
-        turns = torch.eye(3, dtype=points.dtype, device=points.device).repeat(count, model.solver.joint_count, 1, 1)
+        turns = torch.eye(3, dtype=points.dtype, device=points.device).repeat(
+            count, model.solver.joint_count, 1, 1
+        )
         places = points.new_zeros(count, model.solver.joint_count, 3)
         hips = points.new_zeros(count, 3)
         for joint, above, own, hinge in self.steps:
@@ -102,8 +104,11 @@ class PointStart(torch.nn.Module):
                 seen = weights[:, self.centre[joint], None] > 0
                 place = torch.where(seen, points[:, self.centre[joint]], place)
             places[:, joint] = place
-            bend = None if hinge is None else self._bend(hinge, points, weights, place)
-            turns[:, joint] = self._turn(weight, points - place[:, None], arms, expected, bend)
+            aims = points - place[:, None]
+            turns[:, joint] = turn = self._turn(weight, aims, arms, expected, None)
+            if hinge is not None:
+                bend = self._bend(hinge, points, weights, place, turn)
+                turns[:, joint] = self._turn(weight, aims, arms, expected, bend)
         variables = model.solver.variables
         relative = mean.repeat(count, 1, 1, 1)
         relative[:, variables] = turns[:, model.parents[variables]].mT @ turns[:, variables]
@@ -139,8 +144,13 @@ class PointStart(torch.nn.Module):
         covariance = covariance + (_EXPECTED * size + 1e-12)[:, None, None] * expected
         return self._nearest(covariance)
 
-    def _bend(self, hinge, points: Tensor, weights: Tensor, place: Tensor) -> tuple[Tensor, Tensor]:
-        """Normal (F, 3) of a bent limb, as long as the sine of its bend, and the axis (3,) that it lies on."""
+    def _bend(
+        self, hinge: tuple[int, np.ndarray], points: Tensor, weights: Tensor, place: Tensor, turn: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """Normal (F, 3) of a bent limb, as long as the sine of its bend, and the axis (3,) that it lies on.
+
+        A slight bend to the wrong side of a limb turned by `turn` (F, 3, 3) is noise, and none.
+        """
         joint, axis = hinge
         middle = self.centre[joint]
         own = next((weight for j, _, weight, _ in self.steps if j == joint), None)
@@ -153,6 +163,8 @@ class PointStart(torch.nn.Module):
         unit = torch.nn.functional.normalize
         normal = torch.linalg.cross(unit(first, dim=-1), unit(second, dim=-1), dim=-1)
         seen = (weights[:, middle] > 0) & (total.squeeze(1) > 0)
+        wrong = (normal * (turn @ points.new_tensor(axis))).sum(-1) < 0
+        seen = seen & ~(wrong & (normal.norm(dim=-1) < _SLIGHT))
         return normal * seen[:, None], points.new_tensor(axis)
 
     def _expected(self, rest: PointRest) -> Tensor:

@@ -1,4 +1,4 @@
-"""Pose from points: joints, keypoints or markers to the rig's rotations (paper, section 3.6, of few points)."""
+"""Pose from points: joints, keypoints or markers to the rig's rotations."""
 
 from __future__ import annotations
 
@@ -24,12 +24,13 @@ from soma_core.skeleton.identity import Identity
 
 __all__ = ["PointInversion", "PointResult"]
 
+
 class PointInversion(Derived):
     """Recovers the rig's rotations from named points; keeps no state between calls.
 
     The solver is that of :class:`PoseInversion`: points are a cloud of few. What they leave open is left to
-    what is known of a person's joints, weighed against the points by their noise, which is estimated from what
-    the fit leaves: exact points are met exactly, noisy ones are not followed into impossible poses.
+    what is known of a person's joints, weighed against the points by their noise, which is estimated from
+    what the fit leaves: exact points are met exactly, noisy ones are not followed into impossible poses.
 
     Args:
         layer: makes identities and poses them.
@@ -57,10 +58,18 @@ class PointInversion(Derived):
         check_choice("kernels", kernels, ("auto", "torch", "warp"))
         if noise is not None and not 0 < noise < torch.inf:
             raise InputError(
-                "noise", got=noise, expected="a length above zero [m]", fix="Leave it out to have it estimated."
+                "noise",
+                got=noise,
+                expected="a length above zero [m]",
+                fix="Leave it out to have it estimated.",
             )
         self.layer, self.points = layer, load_point_set(points)
-        self.prior, self.noise, self.iterations, self.kernels = prior or JointPrior(), noise, iterations, kernels
+        self.prior, self.noise, self.iterations, self.kernels = (
+            prior or JointPrior(),
+            noise,
+            iterations,
+            kernels,
+        )
         self._build(self.device, self.dtype)
 
     def _build(self, device: torch.device, dtype: torch.dtype) -> None:

@@ -12,8 +12,8 @@ import torch
 from torch import Tensor
 
 from soma_core._derived import Derived, own_precision
-from soma_core._inputs import common_batch
 from soma_core.animation.engine import Animation, Body
+from soma_core.animation.fused import FusedPose
 from soma_core.animation.kinematics import relative_from_absolute
 from soma_core.animation.posed import Posed
 from soma_core.animation.skinning import Skinning
@@ -30,7 +30,7 @@ from soma_core.rig.mesh import CanonicalMesh
 from soma_core.rig.skeleton import Rig
 from soma_core.skeleton.identity import Identity
 
-__all__ = ["BodyPart", "PartialBodies"]
+__all__ = ["BodyPart", "PartialBodies", "as_matrices"]
 
 
 class _Layer(Protocol):
@@ -46,6 +46,8 @@ class _Layer(Protocol):
     posing: Animation
     correctives: Correctives | None
     rest_shape: ComposedRestShape | ExactRestShape
+    fused: FusedPose | None
+    _fusible: Callable[..., bool]
     _body: Callable[..., Body]
     _identity: Callable[..., Identity]
 
@@ -86,10 +88,12 @@ class BodyPart(torch.nn.Module):
         rest, bind = points, fitted
         if layer.repose:
             transforms, bind = layer.animation.to_bind_pose(fitted)
-            rest = points if self.rest_skinning is None else self.rest_skinning(points, transforms, rows=False)
+            rest = (
+                points if self.rest_skinning is None else self.rest_skinning(points, transforms, rows=False)
+            )
         return Identity(
-            rest=rest.permute(2, 1, 0), bind_world=bind, fitted_rest=points.permute(2, 1, 0), fitted_world=fitted,
-            rig_revision=layer.rig.revision, params=batch,
+            rest=rest.permute(2, 1, 0), bind_world=bind, fitted_rest=points.permute(2, 1, 0),
+            fitted_world=fitted, rig_revision=layer.rig.revision, params=batch,
         )  # fmt: skip
 
     def pose(
@@ -108,7 +112,9 @@ class BodyPart(torch.nn.Module):
         """
         layer = self.layer
         body = layer._body(identity, rotations, translation, bone_scale)
-        return self._posed(body._replace(identity=replace(identity, rest=identity.rest[:, self.ids])), absolute)
+        return self._posed(
+            body._replace(identity=replace(identity, rest=identity.rest[:, self.ids])), absolute
+        )
 
     def forward(
         self,
@@ -121,7 +127,9 @@ class BodyPart(torch.nn.Module):
     ) -> Posed:
         """Pose bodies of parameters, as ``SomaLayer.forward`` does, without the rest of their mesh."""
         layer, own = self.layer, self.identity(params)
-        whole = replace(own, rest=own.rest.new_zeros(1, 1, 3).expand(len(own.rest), layer.mesh.vertex_count, 3))
+        whole = replace(
+            own, rest=own.rest.new_zeros(1, 1, 3).expand(len(own.rest), layer.mesh.vertex_count, 3)
+        )
         body = layer._body(whole, rotations, translation, bone_scale)
         return self._posed(body._replace(identity=own), absolute)
 
@@ -130,28 +138,48 @@ class BodyPart(torch.nn.Module):
 
     def _posed(self, body: Body, absolute: bool) -> Posed:
         layer, identity = self.layer, body.identity
-        relative = _matrices(body.relative)
-        body = body._replace(relative=relative)
-        world = layer.posing.transforms(body, absolute=absolute)
-        batch = common_batch(identity.batch_size, len(relative))
-        vertices = world.new_zeros(batch, 0, 3)
+        if layer._fusible(*body[:4]):
+            assert layer.fused is not None
+            world, joints, skin, _ = layer.fused._bodies(
+                identity.bind_world, *body[1:3], absolute=absolute, bone_scale=body.bone_scale
+            )
+        else:
+            body = body._replace(relative=as_matrices(body.relative))
+            world = layer.posing.transforms(body, absolute=absolute)
+            joints, skin = world[:, 1:, :3, 3], None
+        vertices = world.new_zeros(len(world), 0, 3)
         if self.skinning is not None:
-            rotations, positions = world[..., :3, :3], world[..., :3, 3]
-            given = identity, rotations, positions, body.bone_scale
-            transforms = layer.posing._skinning_transforms(*given)
+            if skin is None:
+                turned = world[..., :3, :3], world[..., :3, 3], body.bone_scale
+                skin = layer.posing._skinning_transforms(identity, *turned)
             rest = identity.rest
             if self.correctives is not None:
-                if absolute:
-                    kinematics = layer.animation.kinematics
-                    orient = kinematics.orient[1:], kinematics.parent_orient[1:]
-                    relative = relative_from_absolute(relative, *orient)
-                rest = rest + self.correctives(relative, identity.bind_world)
-            vertices = self.skinning(rest.permute(2, 1, 0), transforms, rows=True)
-        return Posed(vertices=vertices, joints=world[:, 1:, :3, 3], transforms=world)
+                rest = rest + self._moves(identity, as_matrices(body.relative), absolute)
+            vertices = self.skinning(rest.permute(2, 1, 0), skin, rows=True)
+        return Posed(vertices=vertices, joints=joints, transforms=world)
+
+    def _moves(self, identity: Identity, relative: Tensor, absolute: bool) -> Tensor:
+        """What correctives add to the vertices of this part, (batch, u, 3) [m]."""
+        assert self.correctives is not None
+        if absolute:
+            kinematics = self.layer.animation.kinematics
+            relative = relative_from_absolute(relative, kinematics.orient[1:], kinematics.parent_orient[1:])
+        return self.correctives(relative, identity.bind_world)
 
 
 class PartialBodies(Derived):
     """What a layer gives of bodies without their whole mesh."""
+
+    animation: Animation
+    posing: Animation
+    correctives: Correctives | None
+    mesh: CanonicalMesh
+    rig: Rig
+
+    @property
+    def plain(self) -> bool:
+        """Whether a layer poses by linear blend skinning alone, without twist joints and correctives."""
+        return self.posing is self.animation and self.correctives is None
 
     @own_precision
     def subset(self, ids: Tensor | Sequence[int] | np.ndarray) -> BodyPart:
@@ -217,7 +245,8 @@ class PartialBodies(Derived):
         return places(posed.transforms, posed.vertices[:, places.vertex_ids])
 
 
-def _matrices(rotations: Tensor) -> Tensor:
+def as_matrices(rotations: Tensor) -> Tensor:
+    """Matrices (..., 3, 3) from checked rotations of either form, (B, J - 1, 3) or (B, J - 1, 3, 3)."""
     return axis_angle_to_matrix(rotations) if rotations.ndim == 3 else rotations
 
 

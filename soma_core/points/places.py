@@ -102,7 +102,9 @@ class PointPlaces(torch.nn.Module):
         if self.has_offsets:
             turns = transforms[..., :3, :3] @ self.back
             reach = self.size(joints)[:, None, None] * self.offset
-            moved = torch.einsum("bpac,bpc->bpa", torch.einsum("pj,bjac->bpac", self.joint_weight, turns), reach)
+            moved = torch.einsum(
+                "bpac,bpc->bpa", torch.einsum("pj,bjac->bpac", self.joint_weight, turns), reach
+            )
             points = points + moved
         if self._skin is not None and vertices is not None:
             flat = vertices.permute(1, 2, 0).flatten(1)

@@ -1,0 +1,148 @@
+"""Pose from points: exact ones come back, noise is told, what they leave open is as expected."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from soma_core import SomaLayer
+from soma_core.errors import InputError
+from soma_core.evaluation.random_poses import random_axis_angles
+from soma_core.geometry.rotations import axis_angle_to_matrix
+from soma_core.inversion.point_priors import JointPrior, JointRange
+from soma_core.inversion.points import PointInversion
+from soma_core.points.point_set import Point, PointSet
+from tests.bodies import randn
+
+EXACT = 1e-4
+"""Largest distance of an exact point after the fit [m]: the acceptance bound of joints."""
+
+LAYER = SomaLayer("soma", lod="low")
+IDENTITY = LAYER.identity()
+NAMES = list(LAYER.joint_names)
+
+
+def _poses(count: int, seed: int = 0) -> Tensor:
+    return torch.as_tensor(random_axis_angles(NAMES, count, np.random.default_rng(seed))).float()
+
+
+def _angle(first: Tensor, second: Tensor) -> Tensor:
+    turn = first.mT @ second
+    return torch.rad2deg(torch.acos(((turn.diagonal(dim1=-2, dim2=-1).sum(-1) - 1) / 2).clamp(-1, 1)))
+
+
+def _axes(posed, identity=IDENTITY) -> tuple[Tensor, Tensor]:
+    """Places of all joints, and unit axes of all bones."""
+    places = posed.transforms[:, 1:, :3, 3]
+    bones = places[:, 1:] - places[:, LAYER.rig.parents[2:] - 1]
+    return places, torch.nn.functional.normalize(bones, dim=-1)
+
+
+@pytest.mark.parametrize("kernels", ["auto", "torch"])
+def test_all_joints_come_back(kernels: str) -> None:
+    count = 64 if kernels == "auto" else 4
+    posed = LAYER.joints(IDENTITY, _poses(count), randn(count, 3).float())
+    result = PointInversion(LAYER, "soma77", kernels=kernels)(posed.joints, IDENTITY)
+    again = LAYER.joints(IDENTITY, result.rotations, result.translation)
+    (places, bones), (found, turned) = _axes(posed), _axes(again)
+    assert (places - found).norm(dim=-1).max() < EXACT
+    assert torch.rad2deg((bones - turned).norm(dim=-1)).max() < 0.1
+    # Joints whose turn two or more children determine, that do not lie on one line.
+    joints = [NAMES.index(name) for name in ("Hips", "Chest", "Head", "LeftHand", "RightHand")]
+    off = _angle(posed.transforms[:, 1:, :3, :3], again.transforms[:, 1:, :3, :3])[:, joints]
+    assert off.max() < 0.5
+    assert result.noise < 1e-4
+    assert bool(result.valid.all())
+    assert bool(result.converged.all())
+
+
+def test_noise_is_told_and_its_angles_claimed() -> None:
+    count, noise = 128, 0.01
+    rest, pull = (torch.as_tensor(one[1:]) for one in JointPrior().of(LAYER.rig.joint_names))
+    stiffness = pull.diagonal(dim1=-2, dim2=-1).sum(-1)[:, None, None] * torch.eye(3) - pull
+    spread = torch.linalg.cholesky(torch.linalg.inv(stiffness + 1e-6 * torch.eye(3)))
+    vectors = (spread @ randn(count, 77, 3)[..., None]).squeeze(-1)
+    vectors[:, stiffness.diagonal(dim1=-2, dim2=-1).sum(-1) < 1e-3] = 0  # nothing is expected of the Hips
+    hinges = [row - 1 for row in JointPrior().hinges(LAYER.rig.joint_names)]
+    vectors[:, hinges] *= 0.5  # no limb bends backwards
+    truth = (rest @ axis_angle_to_matrix(vectors)).float()
+    posed = LAYER.joints(IDENTITY, truth)
+    seen = posed.joints + noise * randn(*posed.joints.shape, seed=1, dtype=torch.float32)
+    result = PointInversion(LAYER, "soma77")(seen, IDENTITY)
+    assert result.noise == pytest.approx(noise, rel=0.1)
+    body = [NAMES.index(name) for name in ("Hips", "LeftArm", "LeftLeg", "Neck1", "Chest", "RightHand")]
+    off, claimed = _angle(result.rotations, truth)[:, body], result.angle_std[:, body]
+    ratio = off.square().mean(0).sqrt() / claimed.square().mean(0).sqrt()
+    assert bool(((ratio > 0.7) & (ratio < 1.4)).all())
+
+
+def test_gaps_weights_and_single_frames_change_no_other() -> None:
+    posed = LAYER.joints(IDENTITY, 0.5 * _poses(6, 2))
+    inversion = PointInversion(LAYER, "humanml3d22", noise=1e-3)
+    points = LAYER.points(posed, "humanml3d22")
+    whole = inversion(points, IDENTITY)
+    gaps = points.clone()
+    gaps[1, 4], gaps[2, 5:] = torch.nan, torch.nan
+    gaps[3, 2:] = torch.nan
+    result = inversion(gaps, IDENTITY)
+    assert result.valid.tolist() == [True, True, True, False, True, True]
+    assert torch.isnan(result.point_error[1, 4])
+    assert torch.isnan(result.residual[3])
+    same = [0, 4, 5]
+    assert _angle(result.rotations[same], whole.rotations[same]).max() < 0.2
+    # A point of no weight may be anywhere.
+    wild, weights = points.clone(), torch.ones(22)
+    wild[:, 7], weights[7] = 30.0, 0.0
+    assert (inversion(wild, IDENTITY, weights=weights).point_error[:, :7]).max() < 1e-3
+
+
+def test_what_points_leave_open_is_as_expected() -> None:
+    expected = JointRange(rest=(20.0, 0.0, 0.0), spread=(5.0, 5.0))
+    prior = JointPrior(ranges={**JointPrior().ranges, "LeftHand": expected})
+    posed = LAYER.joints(IDENTITY, 0.5 * _poses(3, 3))
+    result = PointInversion(LAYER, "humanml3d22", prior=prior)(LAYER.points(posed, "humanml3d22"), IDENTITY)
+    hand = NAMES.index("LeftHand")
+    angle = _angle(result.rotations[:, hand], torch.eye(3).expand(3, 3, 3))
+    torch.testing.assert_close(angle, torch.full((3,), 20.0), atol=0.1, rtol=0)
+    assert not bool(result.determined[:, hand].any())
+    torch.testing.assert_close(result.angle_std[:, hand], torch.full((3,), 5.0 * 3**0.5), atol=0.1, rtol=0)
+
+
+def test_points_of_the_skin_are_those_of_the_whole_model() -> None:
+    ids = np.linspace(0, 4504, 150).astype(int)
+    points = PointSet(name="skin", points={str(i): Point(vertices={int(i): 1.0}) for i in ids})
+    posed = LAYER.pose(IDENTITY, 0.3 * _poses(8, 4))
+    result = PointInversion(LAYER, points)(LAYER.points(posed, points), IDENTITY)
+    again = LAYER.pose(IDENTITY, result.rotations, result.translation)
+    assert (LAYER.points(again, points) - LAYER.points(posed, points)).norm(dim=-1).mean() < 5e-4
+
+
+def test_other_bodies_and_bone_lengths() -> None:
+    count = 3
+    scale = 1 + 0.2 * torch.tanh(randn(1, 77, dtype=torch.float32))
+    posed = LAYER.joints(IDENTITY, 0.5 * _poses(count, 5), bone_scale=scale)
+    result = PointInversion(LAYER, "soma77")(posed.joints, IDENTITY, bone_scale=scale)
+    assert result.point_error.max() < EXACT
+    without = PointInversion(LAYER, "soma77")(posed.joints, IDENTITY)
+    assert without.noise > 1e-3
+
+
+@pytest.mark.parametrize(
+    ("points", "said"),
+    [
+        (torch.zeros(2, 21, 3), r"\(2, 21, 3\)"),
+        (torch.zeros(2, 22, 3, dtype=torch.int64), "int64"),
+        (np.zeros((2, 22, 3)), "ndarray"),
+    ],
+)
+def test_what_is_no_points_is_refused(points: object, said: str) -> None:
+    with pytest.raises(InputError, match=said):
+        PointInversion(LAYER, "humanml3d22")(points, IDENTITY)
+
+
+def test_another_unit_is_refused_with_its_factor() -> None:
+    points = LAYER.points(LAYER.joints(IDENTITY, _poses(2)), "humanml3d22")
+    with pytest.raises(InputError, match=r"Multiply the points by 0\.01"):
+        PointInversion(LAYER, "humanml3d22")(100 * points, IDENTITY)
