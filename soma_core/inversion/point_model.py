@@ -62,12 +62,14 @@ class PointModel(torch.nn.Module):
         variables: (n,) joints that points say anything about.
         mean: (J, 3, 3) where a pose is expected.
         spread: (J,) root mean square angle [degrees] that each joint is expected to be off by.
+        pull: (J, 3, 3) how strongly it is, as ``JointPrior.of`` says [1/rad^2].
         prior: (p, 4, 4) moments of the prior, of the solver's pairs [1/rad^2].
     """
 
     prior: Tensor
     hold: Tensor
     mean: Tensor
+    pull: Tensor
     spread: Tensor
 
     def __init__(self, layer: SomaLayer, places: PointPlaces, prior: JointPrior, *, warp: bool) -> None:
@@ -82,7 +84,7 @@ class PointModel(torch.nn.Module):
         ties = np.zeros((len(tied), rig.joint_count))
         ties[np.arange(len(tied)), tied] = ties[np.arange(len(tied)), parents[tied]] = 1
         rows = scipy.sparse.csr_array(np.concatenate([carried.astype(float), ties]))
-        structure = skin_structure(replace(rig, weights=rows), np.ones(rows.shape[0], bool))
+        structure = skin_structure(replace(rig, weights=rows, procedural=None), np.ones(rows.shape[0], bool))
         self.structure = structure
         self.solver = GaussNewton(structure, warp=warp, **kind)
         self.joints, self.variables = structure.joints, structure.variables
@@ -100,7 +102,7 @@ class PointModel(torch.nn.Module):
         keep = {
             "prior": moments, "mean": self.prior_mean,
             "parents": np.maximum(parents, 0), "weighted": structure.joints,
-            "spread": _spread(blocks), "hold": _HELD * _hold(structure.pairs),
+            "spread": _spread(blocks), "pull": blocks, "hold": _HELD * _hold(structure.pairs),
         }  # fmt: skip
         for key, array in keep.items():
             tensor = torch.as_tensor(np.ascontiguousarray(array), device=layer.device)
