@@ -28,6 +28,7 @@ __all__ = [
     "Product",
     "RotationLayout",
     "RotationZero",
+    "Skinning",
     "SmplLayout",
     "SmplModel",
     "Topology",
@@ -50,6 +51,14 @@ class BodyGender(StrEnum):
     neutral = "neutral"
     male = "male"
     female = "female"
+
+
+class Skinning(StrEnum):
+    """What a fit poses by: the full model, plain skinning, or whichever describes a frame."""
+
+    auto = "auto"
+    full = "full"
+    plain = "plain"
 
 
 class SmplLayout(StrEnum):

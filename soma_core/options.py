@@ -36,6 +36,7 @@ from soma_core.choices import (
     Product,
     RotationLayout,
     RotationZero,
+    Skinning,
     SmplLayout,
     SmplModel,
     Topology,
@@ -79,6 +80,7 @@ __all__ = [
     "Product",
     "RotationLayout",
     "RotationZero",
+    "Skinning",
     "SmplLayout",
     "SmplModel",
     "Topology",
@@ -245,6 +247,7 @@ class InversionChoice(Options):
     robust: float | None = None
     robust_rounds: int = 10
     refreshes: int = 30
+    skinning: Skinning = Skinning.auto
     analytical: AnalyticalChoice = field(default_factory=AnalyticalChoice)
     autograd: AutogradChoice = field(default_factory=AutogradChoice)
     priors: PriorChoice = field(default_factory=PriorChoice)

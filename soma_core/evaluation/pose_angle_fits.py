@@ -73,7 +73,7 @@ class Fit:
         mean_mm, max_mm: (F,) vertex error of each frame, mouth and eye bags left out; NaN where not valid.
         angles: (F, K) between fitted and true rotations [degrees], of the `joints`; K = 0 without a truth.
         joints: (K,) names.
-        converged: (F,) bool, as flagged.
+        converged, plain: (F,) bool, as flagged.
         seconds: that the fit took.
         result: None for a part.
     """
@@ -83,6 +83,7 @@ class Fit:
     angles: np.ndarray
     joints: tuple[str, ...]
     converged: np.ndarray
+    plain: np.ndarray
     seconds: float
     result: InversionResult | None = None
 
@@ -90,7 +91,8 @@ class Fit:
         """Some of the frames; the time is not divided."""
         return Fit(
             mean_mm=self.mean_mm[frames], max_mm=self.max_mm[frames], angles=self.angles[frames],
-            joints=self.joints, converged=self.converged[frames], seconds=float("nan"),
+            joints=self.joints, converged=self.converged[frames], plain=self.plain[frames],
+            seconds=float("nan"),
         )  # fmt: skip
 
     @staticmethod
@@ -102,6 +104,7 @@ class Fit:
             angles=np.concatenate([fit.angles for fit in fits]),
             joints=fits[0].joints,
             converged=np.concatenate([fit.converged for fit in fits]),
+            plain=np.concatenate([fit.plain for fit in fits]),
             seconds=sum(fit.seconds for fit in fits),
         )
 
@@ -175,6 +178,7 @@ def fit_frames(
         angles=angles,
         joints=tuple(layer.joint_names[joint] for joint in joints),
         converged=result.converged.cpu().numpy(),
+        plain=result.plain.cpu().numpy(),
         seconds=seconds,
         result=result,
     )

@@ -84,7 +84,7 @@ def anny_rig_motions(
     ]  # fmt: skip
     columns = (
         "body", "layer", "frames", "mean, mm", "max, mm", "over plain, mm", "turn beyond the bone's, degrees",
-        "of the joint", "the bone's turn, degrees", "converged, %", "frames/s",
+        "of the joint", "the bone's turn, degrees", "converged, %", "by plain skinning, %", "frames/s",
     )  # fmt: skip
     table = Table(title="smooth motions of Anny's own rig", columns=columns, rows=rows)
     return Piece(layer=label, table=table, figures=figures)
@@ -93,7 +93,8 @@ def anny_rig_motions(
 def _cells(fit: Fit, over: float, excess: TurnExcess) -> tuple[str | float | None, ...]:
     return (
         len(fit.converged), float(fit.mean_mm.mean()), float(fit.max_mm.max()), over, excess.excess,
-        excess.joint, excess.true, 100 - fit.not_converged, len(fit.converged) / fit.seconds,
+        excess.joint, excess.true, 100 - fit.not_converged, 100 * float(fit.plain.mean()),
+        len(fit.converged) / fit.seconds,
     )  # fmt: skip
 
 

@@ -96,7 +96,8 @@ def fit_identity(
     found = ShapeFound(identity=begin, history=(), converged=True)
     if method == "backend" or free is None or free:
         parameters = FreeParameters(layer, start, free)
-        found = search_parameters(inversion, sample, parameters, iterations=iterations)
+        search = inversion.skinned("full")  # one model all the way, so that errors compare
+        found = search_parameters(search, sample, parameters, iterations=iterations)
     params = found.identity.params
     if method == "unpose":
         found = _unpose(inversion, sample, found, iterations)

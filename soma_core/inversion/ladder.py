@@ -41,7 +41,7 @@ class Ladder(torch.nn.Module):
     def __init__(self, layer: SomaLayer, options: LadderOptions, *, warp: bool) -> None:
         super().__init__()
         self.options = options
-        plain = layer.plain or not options.refreshes
+        plain = layer.plain or not options.refreshes or options.skinning == "plain"
         self.model = PoseModel(layer, plain=plain, warp=warp)
         self.coarse = self.skinned = self.model
         if not plain and layer.mesh.lod == "mid":
@@ -88,6 +88,8 @@ class Ladder(torch.nn.Module):
             return self.whole(targets, pose)
         if problem is None or model is not self.model:
             problem = targets.problem(self.model)
+        if "gauss_newton" in self.options.stages:
+            pose = _moved(self.whole.settled(problem, _moved(pose, -problem.origin)), problem.origin)
         return pose, problem
 
     def _model_of(self, stage: Stage) -> PoseModel:

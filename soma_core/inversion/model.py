@@ -13,7 +13,7 @@ from soma_core.inversion.limbs import LimbStart, TwistShare
 from soma_core.inversion.moments import RestMoments
 from soma_core.inversion.offsets import PoseOffsets
 from soma_core.inversion.priors import JointTerms
-from soma_core.inversion.problem import Problem
+from soma_core.inversion.problem import Pose, Problem
 from soma_core.inversion.skin_model import Kind, SkinModel
 from soma_core.inversion.structure import skin_structure
 from soma_core.layer import SomaLayer
@@ -129,6 +129,33 @@ class PoseModel(SkinModel):
         if self.correctives is None:
             return problem.origin.new_ones(1)
         return self.correctives.scale(problem.identity.bind_world)
+
+    def determined(self, kept: Tensor) -> Tensor:
+        """Whether each user joint is determined, (F, J - 1), by which weighted joints (F, T) are."""
+        count = self.solver.public_count
+        known = kept.new_zeros(len(kept), self.solver.joint_count)
+        known[:, self.moments.joints] = kept
+        if self.driven is not None:  # a bone whose skin lies on twist joints is known by theirs
+            known = known[:, :count] | _any_of(known[:, count:], self.driven.start, count)
+        return known[:, 1:]
+
+    def angle_std(self, problem: Problem, pose: Pose, energy: Tensor) -> Tensor:
+        """Standard deviations (F, J - 1) [degrees] of joint angles, where the noise is what is left.
+
+        Weights count as inverse variances, up to a factor that is estimated.
+        """
+        variables = self.solver.variables
+        spare = 3 * (problem.weights > 0).sum(1) - 3 * (len(variables) + 1)
+        noise = torch.where(spare > 0, energy / spare.clamp_min(1), torch.nan)
+        angle = (self.angle_variance(problem, pose) * noise[:, None]).clamp_min(0).sqrt().rad2deg()
+        every = angle.new_full((len(angle), self.solver.public_count - 1), torch.nan)
+        return every.index_copy(1, variables - 1, angle)
+
+
+def _any_of(flags: Tensor, owner: Tensor, count: int) -> Tensor:
+    """(F, count) whether any flag (F, H) of each owner is set."""
+    total = flags.new_zeros(len(flags), count, dtype=torch.int64).index_add(1, owner, flags.long())
+    return total > 0
 
 
 def _rig_of(rig: Rig, some: np.ndarray) -> Rig:

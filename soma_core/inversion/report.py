@@ -25,7 +25,7 @@ _ANGLE_EDGES = np.geomspace(1e-4, 360.0, 1513)
 """Bins of the standard deviations of joint angles [degrees], 1 % wide."""
 
 _MM = 1e3
-_SUMMED = ("frames", "valid", "converged", "iterations", "counts", "sums", "histogram", "changes")
+_SUMMED = ("frames", "valid", "converged", "plain", "iterations", "counts", "sums", "histogram", "changes")
 _LARGEST = ("most_iterations", "orthonormality", "maxima", "peaks")
 
 
@@ -51,6 +51,7 @@ class InversionReport:
             "frames": np.zeros((), np.int64),
             "valid": np.zeros((), np.int64),
             "converged": np.zeros((), np.int64),
+            "plain": np.zeros((), np.int64),
             "iterations": np.zeros((), np.int64),
             "most_iterations": np.zeros((), np.int64),
             "orthonormality": np.zeros(()),
@@ -126,6 +127,7 @@ class InversionReport:
             "unusable_frames": int(state["frames"]) - valid,
             "unusable": state["unusable"][:_LISTED].tolist(),
             "converged_share": int(state["converged"]) / valid if valid else None,
+            "plain_share": int(state["plain"]) / valid if valid else None,
             "iterations": {
                 "mean": int(state["iterations"]) / valid if valid else None,
                 "max": int(state["most_iterations"]),
@@ -177,6 +179,11 @@ class InversionReport:
             f"shoulder error changes by {_number(change['mean'], '.3g')} mm a frame, "
             f"at most {_number(change['peak'], '.3g')} mm",
         ]
+        if found["plain_share"]:
+            lines.append(
+                f"another rig moved the skin of {found['plain_share']:.1%} of the frames: plain skinning "
+                "describes them better than the full model, and their poses and errors are its"
+            )
         return "\n".join(lines)
 
 
@@ -207,6 +214,7 @@ def _counted(result: InversionResult) -> dict[str, np.ndarray]:
         "frames": np.array(len(valid)),
         "valid": np.array(valid.sum()),
         "converged": np.array((result.converged.cpu().numpy() & valid).sum()),
+        "plain": np.array((result.plain.cpu().numpy() & valid).sum()),
         "iterations": np.array(iterations[valid].sum()),
         "most_iterations": np.array(iterations[valid].max(initial=0)),
         "orthonormality": np.array(float(skew.max()) if skew.numel() else 0.0),

@@ -8,6 +8,10 @@ from dataclasses import dataclass, fields
 import torch
 from torch import Tensor
 
+from soma_core.inversion.problem import Pose
+from soma_core.layer import SomaLayer
+from soma_core.skeleton.identity import Identity
+
 __all__ = ["InversionResult", "joined"]
 
 
@@ -15,7 +19,8 @@ __all__ = ["InversionResult", "joined"]
 class InversionResult:
     """Pose of every frame, and how well it explains the target; paper, section 3.6.
 
-    ``layer.pose(identity, result.rotations, result.translation)`` is the reconstruction.
+    :meth:`posed` reconstructs the target: as ``layer.pose(identity, result.rotations, result.translation)``
+    does, and ``layer.pose_plain`` for the frames that are `plain`.
 
     Attributes:
         rotations: T-pose-relative rotations, (frames, J - 1, 3, 3).
@@ -34,6 +39,9 @@ class InversionResult:
             noticeably.
         iterations: (frames,) int, accepted steps.
         residual: root mean square of the weighted vertex error [m], (frames,); NaN where not valid.
+        plain: (frames,) bool; whether the pose, and all that is said of it, are those of plain skinning under
+            a layer that has more. So are frames whose skin another rig moved, where twist joints and
+            correctives explain less of it than plain skinning does, and all frames if that was asked for.
         angle_std: standard deviation of each joint's own rotation, (frames, J - 1) [degrees]: root mean
             square angle that independent noise of the vertices, as large as the error left, turns the joint
             by against its parent. To first order: many degrees say no more than that it is open. NaN
@@ -48,7 +56,27 @@ class InversionResult:
     converged: Tensor
     iterations: Tensor
     residual: Tensor
+    plain: Tensor
     angle_std: Tensor
+
+    def pose(self, origin: Tensor | float = 0.0) -> Pose:
+        """The poses as a fit takes them, about an origin (frames, 3) [m]; they carry no gradient."""
+        rotations = self.rotations.detach()
+        still = torch.eye(3).to(rotations).expand(len(rotations), 1, 3, 3)
+        return Pose.begin(torch.cat((still, rotations), 1), self.translation.detach() - origin)
+
+    def posed(self, layer: SomaLayer, identity: Identity, bone_scale: Tensor | None = None) -> Tensor:
+        """Vertices (frames, v, 3) [m] of the reconstruction, under the skinning that each frame was told by.
+
+        Args:
+            layer, identity, bone_scale: as given to the fit.
+        """
+        given = identity, self.rotations, self.translation
+        full = layer.pose(*given, bone_scale=bone_scale).vertices
+        if not bool(self.plain.any()):
+            return full
+        plain = layer.pose_plain(*given, bone_scale=bone_scale).vertices
+        return torch.where(self.plain[:, None, None], plain, full)
 
     def where(self, chosen: Tensor, other: InversionResult) -> InversionResult:
         """This result for the frames `chosen` (frames,), another's for the rest."""
@@ -58,8 +86,20 @@ class InversionResult:
             parts[one.name] = torch.where(chosen.view(-1, *[1] * (own.ndim - 1)), own, their)
         return InversionResult(**parts)
 
-    def part(self, chunk: slice) -> InversionResult:
-        """The result of a chunk of frames."""
+    def mean_error(self, weights: Tensor) -> Tensor:
+        """Mean vertex error (frames,) [m] under weights (1 or frames, v)."""
+        known = torch.where(weights > 0, self.vertex_error, 0.0).nan_to_num(nan=0.0)
+        return (weights * known).sum(1) / weights.sum(1)
+
+    def put(self, rows: Tensor, other: InversionResult) -> InversionResult:
+        """This result, with that of another in the place of some frames."""
+        names = [one.name for one in fields(self)]
+        return InversionResult(
+            **{name: getattr(self, name).index_copy(0, rows, getattr(other, name)) for name in names}
+        )
+
+    def part(self, chunk: slice | Tensor) -> InversionResult:
+        """The result of some frames."""
         return InversionResult(**{one.name: getattr(self, one.name)[chunk] for one in fields(self)})
 
 

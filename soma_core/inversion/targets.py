@@ -8,6 +8,7 @@ from typing import Literal, get_args
 
 from torch import Tensor
 
+from soma_core._inputs import check_choice
 from soma_core.errors import InputError
 from soma_core.inversion.analytical import AnalyticalOptions
 from soma_core.inversion.autograd import AutogradOptions
@@ -18,9 +19,11 @@ from soma_core.inversion.problem import Problem, part_of
 from soma_core.inversion.result import InversionResult
 from soma_core.skeleton.identity import Identity
 
-__all__ = ["Frames", "LadderOptions", "Stage", "Targets"]
+__all__ = ["Frames", "LadderOptions", "Skinning", "Stage", "Targets"]
 
 Stage = Literal["procrustes", "transfer", "analytical", "gauss_newton", "autograd"]
+
+Skinning = Literal["auto", "full", "plain"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -40,10 +43,12 @@ class LadderOptions:
         robust_rounds: how often the residuals of the first fit are looked at again.
         refreshes: largest number of steps of ``gauss_newton`` under the full model, with twist joints and
             correctives; 0 fits plain skinning.
+        skinning: ``full`` fits what ``SomaLayer.pose`` poses, ``plain`` what ``SomaLayer.pose_plain`` does;
+            ``auto`` is full but for frames of another rig's skin that plain skinning describes better.
 
     Raises:
-        InputError: an unknown stage, a negative number of iterations or refreshes, a negative tolerance, a
-            robust scale of zero or less.
+        InputError: an unknown stage or skinning, a negative number of iterations or refreshes, a negative
+            tolerance, a robust scale of zero or less.
     """
 
     stages: Sequence[Stage] = ("procrustes", "gauss_newton")
@@ -54,8 +59,10 @@ class LadderOptions:
     robust: float | None = None
     robust_rounds: int = 10
     refreshes: int = 30
+    skinning: Skinning = "auto"
 
     def __post_init__(self) -> None:
+        check_choice("skinning", self.skinning, get_args(Skinning))
         names = get_args(Stage)
         for stage in self.stages:
             if stage not in names:
@@ -126,8 +133,8 @@ class Frames:
     initial: InversionResult | None = None
     reference: Tensor | None = None
 
-    def part(self, chunk: slice) -> Frames:
-        """What is given for a chunk of them."""
+    def part(self, chunk: slice | Tensor) -> Frames:
+        """What is given for some of them."""
         scale = self.bone_scale
         return Frames(
             vertices=self.vertices[chunk],

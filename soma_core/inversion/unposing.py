@@ -76,7 +76,7 @@ class Unposing:
         And the mean squared error (v,) [m^2] that is left: how far the frames disagree.
         """
         turn = self._blends(identity, pose)
-        reached = self._layer.pose(identity, pose.rotations, pose.translation).vertices
+        reached = pose.posed(self._layer, identity)
         away = torch.where(weights[..., None] > 0, (vertices - reached).transpose(0, 1).double(), 0.0)
         matrix = torch.einsum("vf,vfab,vfac->vbc", weights, turn, turn)
         pull = torch.einsum("vf,vfab,vfa->vb", weights, turn, away)

@@ -12,9 +12,10 @@ from soma_core.inversion.model import PoseModel
 from soma_core.inversion.priors import JointTerms
 from soma_core.inversion.problem import Pose, Problem
 from soma_core.inversion.refine import Refinement, clumping
+from soma_core.inversion.result import InversionResult
 from soma_core.inversion.targets import LadderOptions, Targets
 
-__all__ = ["WholeFit", "is_worse", "lopsided", "right_vertices"]
+__all__ = ["WholeFit", "is_worse", "lopsided", "of_another_rig", "right_vertices"]
 
 _ROUNDS, _STEPS = 2, 5
 """How often offsets and limbs' twists are looked at before the descent, and steps on moments after each."""
@@ -37,6 +38,10 @@ in a fold of the correctives beside its minimum, and is tried from further limb 
 _LOPSIDED = 0.1
 """Median over root mean square error: 0.9 where noise is left, 0.19 to 0.47 on meshes of another rig, 0.04
 where limbs stopped in a wrong place."""
+
+_OF_ONE_PIECE = 0.1
+"""Least :func:`clumping` of what another rig's skin leaves: at least 0.4 on meshes of Anny's own rig, at most
+0.03 where noise is left."""
 
 _WRONG = 2.0
 """A vertex is wrong where its residual is this many times as long as one that begins to count linearly: four
@@ -72,6 +77,26 @@ def lopsided(distances: Tensor, weights: Tensor, residual: Tensor) -> Tensor:
     if not bool(large.any()):
         return large
     return large & (median_distance(distances, weights) < _LOPSIDED * residual)
+
+
+def of_another_rig(model: PoseModel, problem: Problem, result: InversionResult) -> Tensor:
+    """Numbers of the frames whose error is more than noise, of one piece and not on few of the vertices.
+
+    Args:
+        model: that was fitted.
+        problem: that was answered.
+        result: the answer.
+    """
+    large = result.valid & (result.residual > _DOUBTFUL[1])
+    large = large & ~lopsided(result.vertex_error, problem.weights, result.residual)
+    rows = torch.nonzero(large).flatten()
+    if not len(rows):
+        return rows
+    many = problem.several(rows)
+    part = problem.part(many)
+    view = model.view(part, result.part(many).pose(part.origin))
+    pieces = clumping(model, view, part.weights.sum(1).expand(len(many)))[: len(rows)]
+    return rows[pieces > _OF_ONE_PIECE]
 
 
 def _clip(distances: Tensor, weights: Tensor, robust: float) -> _Clip:
@@ -145,6 +170,19 @@ class WholeFit:
                 pose = self._descended(self.model, problem, pose, None)
         accepted = steps + pose.accepted
         return replace(pose, translation=pose.translation + problem.origin, accepted=accepted), problem
+
+    def settled(self, problem: Problem, pose: Pose) -> Pose:
+        """Plain skinning's poses, descended on where steps on moments were refused before they rested.
+
+        Where another rig moved the skin, every other one is: they know nothing of the error that stays.
+        """
+        moving = ~(pose.last_change < self.options.tolerance) & (pose.accepted < self.options.iterations)
+        rows = torch.nonzero(moving).flatten()
+        if not len(rows) or not self.options.refreshes:
+            return pose
+        rows = problem.several(rows)
+        part = self._descended(self.model, problem.part(rows), pose.part(rows), None)
+        return pose.put(rows, part)
 
     def _approached(self, problem: Problem, pose: Pose, robust: float | None) -> tuple[Pose, _Clip | None]:
         """Offsets, clips and the limbs' twist are looked at in turns with steps on moments."""

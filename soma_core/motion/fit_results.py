@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 __all__ = ["chunk_arrays", "draw_worst", "fitted_motions", "joined_report", "per_frame", "worst_frames"]
 
-_PER_FRAME = ("valid", "converged", "iterations", "mean_error", "largest_error")
+_PER_FRAME = ("valid", "converged", "plain", "iterations", "mean_error", "largest_error")
 _REPORT = "report_"
 _MM = 1e3
 
@@ -41,6 +41,7 @@ def chunk_arrays(
     outcome = {
         "valid": result.valid.cpu().numpy(),
         "converged": result.converged.cpu().numpy(),
+        "plain": result.plain.cpu().numpy(),
         "iterations": result.iterations.cpu().numpy(),
         "mean_error": np.where(count, mean, np.nan).astype(np.float32),
         "largest_error": np.where(count, skin.max(axis=1), np.nan).astype(np.float32),
@@ -68,7 +69,7 @@ def worst_frames(errors: np.ndarray, count: int, *, apart: int) -> np.ndarray:
 
 
 def per_frame(chunks: FittedChunks) -> dict[str, np.ndarray]:
-    """Outcome of every frame: usable, converged, iterations, mean and largest error of the skin [m].
+    """Outcome of every frame: usable, converged, plain, iterations, mean and largest error of the skin [m].
 
     Errors are NaN where a frame could not be used.
     """
@@ -135,7 +136,8 @@ def draw_worst(
         number, place = divmod(frame, chunks.size)
         arrays = chunks.load(number, "rotations", "translation")
         pose = (torch.as_tensor(array[place : place + 1]).to(layer.device, layer.dtype) for array in arrays)
-        vertices = layer.pose(identity, *pose).vertices[0].cpu().numpy()
+        posed = layer.pose_plain if frames["plain"][frame] else layer.pose
+        vertices = posed(identity, *pose).vertices[0].cpu().numpy()
         mean, largest = (_MM * frames[name][frame] for name in ("mean_error", "largest_error"))
         caption = f"frame {frame}\nmean {mean:.3g} mm, max {largest:.3g} mm"
         bodies.append(

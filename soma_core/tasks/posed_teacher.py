@@ -64,7 +64,7 @@ class PosedTeacher:
         self.name, self._generator = backend, generator
         self._layer = SomaLayer(backend, correctives=None, canonical=canonical, registry=registry)
         self._identity = self._layer.identity()
-        self._inversion = PoseInversion(self._layer)
+        self._inversion = PoseInversion(self._layer, skinning="full")
         self._fit = None
         if not isinstance(generator, HasRandomPoses):
             self._fit = NativeFit(backend, registry=registry)

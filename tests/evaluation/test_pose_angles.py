@@ -130,7 +130,7 @@ def test_a_wrong_frame_needs_both_the_flag_and_the_angle():
     angles = np.array([[0.1, 3.0], [0.1, 3.0], [0.1, 0.2]])
     fit = Fit(
         mean_mm=np.zeros(3), max_mm=np.zeros(3), angles=angles, joints=("LeftHand", "LeftHandIndex2"),
-        converged=np.array([True, False, True]), seconds=1.0,
+        converged=np.array([True, False, True]), plain=np.zeros(3, bool), seconds=1.0,
     )  # fmt: skip
     assert fit.wrong == 1
     assert fit.of(finger_joints).tolist() == [[3.0], [3.0], [0.2]]

@@ -583,7 +583,7 @@ REFUSED_OPTIONS = [
     ({"iterations": -1}, r"iterations: got -1, expected at least 0"),
     ({"tolerance": -1e-3}, r"tolerance: got -0.001, expected a length"),
     ({"robust": 0.0}, r"robust: got 0.0, expected a length"),
-    ({"kernels": "wrap"}, r"kernels: got 'wrap', expected 'auto', 'torch' or 'warp'"),
+    ({"kernels": "wrap"}, r"kernels: got 'wrap', expected one of 'auto', 'torch', 'warp'"),
 ]
 
 
@@ -608,7 +608,9 @@ REFUSED = {
     "native without its axis": (
         lambda t: {"vertices": t[0], "topology": "native"}, r"vertices: got \(4505, 3\), .*backend's own",
     ),
-    "topology": (lambda t: {"topology": "low"}, r"topology: got 'low', expected 'canonical' or 'native'"),
+    "topology": (
+        lambda t: {"topology": "low"}, r"topology: got 'low', expected one of 'canonical', 'native'",
+    ),
     "few weights": (
         lambda t: {"weights": torch.ones(7)}, r"weights: got \(7,\), expected \(4505,\) or \(3, 4505\)",
     ),

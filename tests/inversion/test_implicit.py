@@ -63,6 +63,16 @@ def moved(layer, pose, turns, shift):
     return (fitted.rotations, fitted.translation), (rotations, place)
 
 
+def moved_by_two(layer, pose, turns, shift):
+    """The same of a frame of the full model and one of plain skinning."""
+    rotations, place = axis_angle_to_matrix(turns) @ pose[0], pose[1] + shift
+    identity = layer.identity({"shape": [1.0, -1.0]})
+    full, plain = (by(identity, rotations, place).vertices for by in (layer.pose, layer.pose_plain))
+    fitted = PoseInversion(layer)(torch.cat((full[:1], plain[1:])), identity)
+    assert fitted.plain.tolist() == [False, True]
+    return (fitted.rotations, fitted.translation), (rotations, place)
+
+
 def moved_native(layer, pose, turns, shift):
     """The same of a native model with pose blend shapes."""
     from soma_core.inversion.implicit import attach_gradient
@@ -78,7 +88,7 @@ def moved_native(layer, pose, turns, shift):
     return fitted, (rotations, place)
 
 
-@pytest.fixture(params=["plain", "default", "default float32", "native"])
+@pytest.fixture(params=["plain", "default", "default float32", "two skinnings", "native"])
 def instance(request):
     """A forward model, how it is posed and fitted, and its number of joints."""
     if request.param == "native":
@@ -86,7 +96,8 @@ def instance(request):
         return make_fit(make_rig(model), model), moved_native, 6
     dtype = torch.float32 if request.param.endswith("float32") else torch.float64
     plain = request.param == "plain"
-    return SomaLayer("soma", lod="low", dtype=dtype, procedural=not plain), moved, 77
+    through = moved_by_two if request.param == "two skinnings" else moved
+    return SomaLayer("soma", lod="low", dtype=dtype, procedural=not plain), through, 77
 
 
 def test_fitting_undoes_posing_to_first_order(instance):

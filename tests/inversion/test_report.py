@@ -45,6 +45,7 @@ def result(canonical):
         converged=torch.arange(FRAMES) % 2 == 0,
         iterations=torch.arange(FRAMES),
         residual=torch.zeros(FRAMES),
+        plain=torch.arange(FRAMES) % 3 == 1,
         angle_std=torch.full((FRAMES, len(rig.user_joint_names)), 0.5),
     )
 
@@ -98,6 +99,7 @@ def test_frames_that_could_not_be_used_count_apart(canonical, result):
     found = reported(canonical, result, [FRAMES])
     assert (found["frames"], found["unusable_frames"], found["unusable"]) == (FRAMES, 1, [4])
     assert found["converged_share"] == pytest.approx(5 / 11)
+    assert found["plain_share"] == pytest.approx(3 / 11)
     assert found["iterations"] == {"mean": pytest.approx((66 - 4) / 11), "max": 11}
     assert found["orthonormality"] == pytest.approx(1e-3, rel=1e-3)
 
@@ -165,8 +167,9 @@ def test_the_table_names_every_region(canonical, result):
     lines = report.as_text().splitlines()
     names = [line.split("  ")[0] for line in lines]
     assert names[:7] == ["error, mm", "all", "body", "hands", "feet", "head", "face interior"]
-    assert "12 frames, 1 of them unusable; converged 45.5%, after 5.6 iterations" in lines[-2]
-    assert "shoulder error changes by" in lines[-1]
+    assert "12 frames, 1 of them unusable; converged 45.5%, after 5.6 iterations" in lines[-3]
+    assert "shoulder error changes by" in lines[-2]
+    assert "another rig moved the skin of 27.3% of the frames" in lines[-1]
 
 
 def test_a_result_of_another_mesh_is_refused(result):

@@ -127,6 +127,49 @@ def test_without_refreshes_plain_skinning_is_fitted(layer, identity, moved):
     assert plain(posed(layer, identity, rotations), identity).residual.min() > 5e-4
 
 
+@pytest.fixture(scope="module")
+def two_rigs(layer, identity):
+    """Frames that the full model posed and plain skinning, by turns, with their rotations."""
+    rotations, hips = some_poses(6, seed=7), torch.zeros(6, 3)
+    with torch.no_grad():
+        full, plain = (pose(identity, rotations, hips).vertices for pose in (layer.pose, layer.pose_plain))
+    other = torch.arange(6) % 2 == 1
+    return torch.where(other[:, None, None], plain, full), rotations, other
+
+
+def test_frames_of_another_rig_are_told_by_plain_skinning(
+    layer, inversion, identity, moved, fitted, two_rigs
+):
+    vertices, rotations, other = two_rigs
+    result = inversion(vertices, identity)
+    assert result.plain.tolist() == other.tolist()
+    assert result.converged.all()
+    assert angles(result, rotations)[:, moved].max() < ANGLE_DEG
+    assert 1e3 * result.vertex_error[:, fitted].max() < MAX_MM
+    again = result.posed(layer, identity)
+    torch.testing.assert_close(result.vertex_error, (again - vertices).norm(dim=-1), rtol=0, atol=2e-6)
+    alone = inversion(vertices[3:4], identity)
+    assert alone.plain.all()
+    assert torch.equal(alone.rotations, result.rotations[3:4])
+
+
+def test_noise_is_no_other_rig(inversion, identity, two_rigs):
+    """However large it is: 20 mm hide what the full model adds to plain skinning."""
+    vertices, _, other = two_rigs
+    for size in (2e-3, 2e-2):
+        noisy = vertices[~other] + size * randn(3, *vertices.shape[1:], seed=8).float()
+        assert not inversion(noisy, identity).plain.any()
+
+
+def test_the_skinning_that_is_asked_for_is_fitted(layer, identity, fitted, two_rigs):
+    vertices, _, other = two_rigs
+    for skinning, met in (("full", ~other), ("plain", other)):
+        result = PoseInversion(layer, skinning=skinning)(vertices, identity)
+        assert (result.plain == (skinning == "plain")).all()
+        error = 1e3 * result.vertex_error[:, fitted].mean(1)
+        assert error[met].max() < MAX_MM < error[~met].min()
+
+
 @pytest.mark.parametrize("seed", [0, 1])
 def test_outliers_do_not_turn_joints(layer, identity, moved, seed):
     """One vertex in twenty lies 300 mm off."""

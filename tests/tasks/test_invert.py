@@ -108,13 +108,21 @@ def test_the_report_says_what_was_fitted_and_how_well(source, tmp_path):
 
 
 def test_twist_and_correctives_are_fitted_unless_told_otherwise(layer, source, tmp_path):
-    """To a body of plain skinning, the full model comes near; the report says which model it is about."""
-    invert.run(configured(input=str(source), procedural=True), tmp_path / "full")
+    """To a body of plain skinning, the full model comes near; the report says which model it is about.
+
+    Left to choose, a fit of the full model tells such a body by plain skinning, and says so.
+    """
+    full = {"input": str(source), "procedural": True}
+    invert.run(configured(**full, inversion={"skinning": "full"}), tmp_path / "full")
+    invert.run(configured(**full), tmp_path / "auto")
     invert.run(configured(input=str(source)), tmp_path / "plain")
-    settings, plain = (
-        json.loads((tmp_path / name / "report.json").read_text(encoding="utf-8"))["settings"]
-        for name in ("full", "plain")
-    )
+    reports = [
+        json.loads((tmp_path / name / "report.json").read_text(encoding="utf-8"))
+        for name in ("full", "plain", "auto")
+    ]
+    settings, plain, _ = (report["settings"] for report in reports)
+    assert [report["plain_share"] for report in reports] == [0, 0, 1]
+    assert reports[2]["error_mm"]["all"]["max"] < ROUND_TRIP_MM
     assert (settings["procedural"], plain["procedural"]) == (True, False)
     assert (settings["correctives"], plain["correctives"]) == ("correctives_model.pt", None)
     motion = read_motion(tmp_path / "full/motion.npz")
