@@ -69,6 +69,7 @@ TASKS = {
     ),
     "evaluate": TaskRow(module="evaluate", summary="measure a claim of the paper, in millimetres"),
     "bench": TaskRow(module="bench", summary="time the forward path, correctness first"),
+    "view": TaskRow(module="view", summary="serve a page that shows bodies, poses them and plays motions"),
 }
 
 

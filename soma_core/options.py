@@ -86,6 +86,7 @@ __all__ = [
     "Topology",
     "Translation",
     "Upward",
+    "ViewOptions",
 ]
 
 
@@ -181,6 +182,16 @@ class ModelOptions(Options):
     procedural: bool = True
     correctives: str | None = "auto"
     device: str = "cpu"
+
+
+@dataclass(kw_only=True)
+class ViewOptions(ModelOptions):
+    """The viewer: where its page is, and the detail and frames per second that are sent while bodies move."""
+
+    host: str = "127.0.0.1"
+    port: int = 8080
+    playing: Lod = Lod.low
+    rate: float = 30.0
 
 
 @dataclass(kw_only=True)

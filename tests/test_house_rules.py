@@ -71,7 +71,7 @@ RANKS = [
     {"view"},
     {"motion"},
     {"config", "shape_space", "template", "testing"},
-    {"evaluation"},
+    {"evaluation", "viewer"},
     {"tasks"},
     {"cli"},
 ]

@@ -25,6 +25,7 @@ from soma_core.options import (
     Picture,
     Product,
     Translation,
+    ViewOptions,
 )
 
 __all__ = [
@@ -38,6 +39,7 @@ __all__ = [
     "InvertConfig",
     "TrainCorrectivesConfig",
     "TrainShapeConfig",
+    "ViewConfig",
     "WrapConfig",
     "register_schemas",
 ]
@@ -72,6 +74,22 @@ class AnimateConfig(ModelOptions, WriteOptions, _PlayedMotion):
     seed: int = 0
     write: list[Product] = field(default_factory=lambda: [Product.npz, Product.usd, Product.glb, Product.png])
     picture: Picture = field(default_factory=Picture)
+
+
+@dataclass(kw_only=True)
+class ViewConfig(ViewOptions):
+    """Configuration of ``soma view``."""
+
+    backend: BackendChoice = field(default_factory=_any_backend)
+    beside: list[str] = field(default_factory=list)
+    motion: str | None = None
+    motion_fps: float | None = None
+    motion_unit: LengthUnit | None = None
+    person: str | None = None
+    identity_from: IdentitySource = IdentitySource.backend
+    compare: str | None = None
+    translation: Translation = Translation.ground
+    seed: int = 0
 
 
 @dataclass(kw_only=True)
@@ -207,6 +225,7 @@ SCHEMAS: dict[str, type] = {
     "evaluate": EvaluateConfig,
     "bench": BenchConfig,
     "wrap": WrapConfig,
+    "view": ViewConfig,
 }
 """Task -> schema of its configuration."""
 

@@ -1,0 +1,60 @@
+"""``soma view``: a page in the browser that shows bodies, poses them and plays motions."""
+
+from __future__ import annotations
+
+import logging
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from omegaconf import OmegaConf
+
+from soma_core.motion.options import ConvertOptions
+from soma_core.viewer.page import Page, open_server, serve
+from soma_core.viewer.session import Session
+
+if TYPE_CHECKING:
+    from omegaconf import DictConfig
+
+    from soma_core.config.schema import ViewConfig
+
+__all__ = ["open_session", "run"]
+
+_log = logging.getLogger(__name__)
+
+
+def run(config: DictConfig, output: Path) -> None:
+    """Serve the page until Ctrl-C; what is saved from it goes into `output`.
+
+    Raises:
+        SomaError: a backend, a file or the address cannot be used, or viser is not installed.
+    """
+    options: ViewConfig = OmegaConf.to_object(config)
+    server = open_server(options.host, options.port)
+    try:
+        page = Page(server, open_session(options), output)
+    except BaseException:
+        server.stop()
+        raise
+    serve(page)
+
+
+def open_session(options: ViewConfig) -> Session:
+    """Open what the settings name.
+
+    Raises:
+        SomaError: a backend or a file cannot be used.
+    """
+    session = Session(options, translation=options.translation)
+    chosen = options.backend
+    for name in (chosen.name, *options.beside):
+        _log.info("opening %s", name)
+        own = {"params": chosen.params, "options": chosen.options} if name == chosen.name else {}
+        session.add(name, **own)
+    settings = ConvertOptions(fps=options.motion_fps, unit=options.motion_unit, person=options.person)
+    if options.motion is not None:
+        session.load(options.motion, settings)
+        if options.identity_from == "motion" or (options.compare and session.motion.identity):
+            session.own_body(session.figures[0])
+    if options.compare is not None:
+        session.compare(options.compare, settings)
+    return session
