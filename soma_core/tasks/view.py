@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from omegaconf import OmegaConf
 
 from soma_core.motion.options import ConvertOptions
-from soma_core.viewer.page import Page, open_server, serve
+from soma_core.viewer.page import Page, close, open_server, serve
 from soma_core.viewer.session import Session
 
 if TYPE_CHECKING:
@@ -33,7 +33,7 @@ def run(config: DictConfig, output: Path) -> None:
     try:
         page = Page(server, open_session(options), output)
     except BaseException:
-        server.stop()
+        close(server)
         raise
     serve(page)
 

@@ -29,7 +29,7 @@ from soma_core.viewer.scene import Scene, Switches
 from soma_core.viewer.session import PRESETS, Figure, Session
 from soma_core.viewer.sliders import Controls, ParameterSliders
 
-__all__ = ["Page", "open_server", "serve", "settings_of"]
+__all__ = ["Page", "close", "open_server", "serve", "settings_of"]
 
 _log = logging.getLogger(__name__)
 
@@ -93,8 +93,7 @@ class Page:
         return handle
 
     def _make_timeline(self) -> None:
-        self.handles["timeline"] = self.server.gui.add_folder("Time")
-        with self.handles["timeline"]:
+        with self.server.gui.add_folder("Time"):
             self._add("play", "button", "Play", act=lambda *_: self.play(on=not self.session.playing))
             self._add("frame", "slider", "frame", 0, 1, 1, 0, act=lambda value, _: self.seek(value))
             self._add("speed", "dropdown", "speed", tuple(_SPEEDS), initial_value="1×",
@@ -137,7 +136,7 @@ class Page:
 
     def _make_view(self, _: Any) -> None:
         for name, title in (("mesh", "mesh"), ("skeleton", "skeleton"), ("names", "names of joints"),
-                            ("errors", "colours of errors")):  # fmt: skip
+                            ("errors", "colours of errors"), ("follow", "follow the body")):  # fmt: skip
             self._add(name, "checkbox", title, getattr(self.switches, name),
                       act=lambda value, _, name=name: self._switch(name, value))  # fmt: skip
         for name, title in (("correctives", "correctives"), ("procedural", "twist joints")):
@@ -329,7 +328,7 @@ class Page:
 
     def _show_motion(self) -> None:
         motion, count = self.session.motion, self.session.frame_count
-        self.handles["timeline"].visible = count > 1
+        self.handles["play"].disabled = self.handles["frame"].disabled = count < 2
         self.handles["frame"].max = max(count - 1, 1)
         told = f"**{motion.source or 'a motion'}**"
         if count > 1:
@@ -441,7 +440,7 @@ def open_server(host: str, port: int) -> Any:
             "soma view needs viser, which is not installed. Run: pip install 'soma-body-core[view]'."
         ) from error
     found = _free_port(host, port)
-    if found != port:
+    if found != port and port:
         _log.info("port %d is taken; this is the next", port)
     with contextlib.redirect_stdout(io.StringIO()):  # its own banner
         return viser.ViserServer(host=host, port=found, verbose=False)
@@ -476,6 +475,12 @@ def _no_host(host: str) -> InputError:
     )  # fmt: skip
 
 
+def close(server: Any) -> None:
+    """End a server without its own words."""
+    with contextlib.redirect_stdout(io.StringIO()):
+        server.stop()
+
+
 def serve(page: Page) -> None:
     """Serve until Ctrl-C."""
     server = page.server
@@ -492,5 +497,4 @@ def serve(page: Page) -> None:
     except KeyboardInterrupt:
         _log.info("ended")
     finally:
-        with contextlib.redirect_stdout(io.StringIO()):
-            server.stop()
+        close(server)

@@ -23,8 +23,14 @@ _BONE, _JOINT, _CHOSEN = (38, 70, 140), (240, 190, 60), (214, 60, 50)
 _GHOST = 0.45
 """Opacity of skin through which bones are seen."""
 
+_BANDS = 7
+"""Colours of errors."""
+
 _GIZMO = 0.16
 """Radius of the rings that turn a joint [m]."""
+
+_SECTION, _SINK = 1.0, 0.004
+"""Squares of the floor, and how far it lies below the soles that stand, which give by a few millimetres [m]."""
 
 
 @dataclass
@@ -36,6 +42,7 @@ class Switches:
     names: bool = False
     errors: bool = True
     gizmo: bool = False
+    follow: bool = True
     joint: str = "LeftArm"
 
 
@@ -67,12 +74,12 @@ class Scene:
         scene.set_up_direction("+y")
         scene.world_axes.visible = False
         scene.configure_environment_map("studio", environment_intensity=0.5)
-        scene.add_grid(
-            "/floor", plane="xz", infinite_grid=True, cell_size=0.25, section_size=1.0, fade_distance=14.0,
+        self._shift = np.zeros(3)
+        self._floor = scene.add_grid(
+            "/floor", plane="xz", infinite_grid=True, cell_size=_SECTION / 4, section_size=_SECTION, fade_distance=14.0,
             cell_color=(226, 226, 222), section_color=(200, 200, 196), shadow_opacity=0.3,
-            plane_color=(246, 246, 244), plane_opacity=1.0, position=(0, -0.004, 0),
+            plane_color=(246, 246, 244), plane_opacity=1.0, position=(0, -_SINK, 0),
         )  # fmt: skip
-        server.initial_camera.position, server.initial_camera.look_at = (1.5, 1.5, 3.4), (0.0, 0.88, 0.0)
         server.initial_camera.up, server.initial_camera.fov = (0.0, 1.0, 0.0), np.radians(34)
 
     def draw(self, *, moving: bool) -> None:
@@ -86,18 +93,26 @@ class Scene:
             self._clear()
         shapes = [session.shape(figure, moving=moving) for figure in session.figures]
         errors = self._errors(shapes)
+        self._follow(shapes)
         with self._server.atomic():
             for figure, shape in zip(session.figures, shapes, strict=True):
                 first = figure is session.figures[0]
                 shown = switches.mesh and not (first and errors is not None)
                 root = self._root(figure)
-                root.position = (session.offset(figure), 0.0, 0.0)
+                root.position = self._shift + [session.offset(figure), 0, 0]
                 self._mesh(figure, shape, visible=shown, moving=moving)
                 self._bones(figure, shape)
                 self._names(figure, shape, visible=switches.names and first)
+                self._title(figure, shape)
             if shapes:
                 self._painted(session.figures[0], shapes[0], errors)
                 self._gizmo(session.figures[0], shapes[0])
+
+    def _follow(self, shapes: list[Shape]) -> None:
+        """Keep the first body in the middle, and let the floor pass under it."""
+        hips = shapes[0].joints[0] if shapes and shapes[0].joints is not None else np.zeros(3)
+        self._shift = -hips * [1, 0, 1] if self.switches.follow else np.zeros(3)
+        self._floor.position = np.fmod(self._shift, _SECTION) + [0, -_SINK, 0]
 
     def _node(self, key: str, make: Callable[[], Any]) -> Any:
         if key not in self._nodes:
@@ -110,6 +125,9 @@ class Scene:
             if not getattr(node, "_impl").removed:  # noqa: B009 - a parent takes its children along
                 node.remove()
         self._figures = list(self._session.figures)
+        wide = self._session.spacing * (len(self._figures) - 1)
+        camera = self._server.initial_camera  # of browsers that come from now on; the panel is to the right
+        camera.position, camera.look_at = (1.6, 1.5, 3.5 + 1.2 * wide), (0.25 + 0.1 * wide, 0.86, 0.0)
 
     def _path(self, figure: Figure, part: str = "") -> str:
         return f"/body{self._session.figures.index(figure)}{part}"
@@ -178,6 +196,15 @@ class Scene:
             if visible:
                 node.position = shape.joints[index]
 
+    def _title(self, figure: Figure, shape: Shape) -> None:
+        """Whose body it is, above the head, where there are several."""
+        path = self._path(figure, "/title")
+        node = self._node(path, lambda: self._server.scene.add_label(path, figure.name, anchor="bottom-center"))
+        node.visible = len(self._session.figures) > 1 and self._session.spacing > 0
+        if node.visible:
+            top = shape.vertices[shape.vertices[:, 1].argmax()]
+            node.position = (shape.vertices[:, 0].mean(), top[1] + 0.06, shape.vertices[:, 2].mean())
+
     def _errors(self, shapes: list[Shape]) -> np.ndarray | None:
         """Errors [mm] of the first body, where it is compared with another."""
         if self._session.compared is None or not self.switches.errors:
@@ -188,17 +215,24 @@ class Scene:
         return errors
 
     def _painted(self, figure: Figure, shape: Shape, errors: np.ndarray | None) -> None:
-        """The first body in the colours of its errors; viser's meshes have one colour, its points have their own."""
-        path = self._path(figure, "/errors")
-        if path in self._nodes:
-            self._nodes.pop(path).remove()
-        if errors is None or not self.switches.mesh:
-            return
-        colours = np.round(255 * error_colours(errors, self.top_mm)).astype(np.uint8)
-        self._nodes[path] = self._server.scene.add_point_cloud(
-            path, shape.vertices, colours, point_size=0.011 if len(shape.vertices) > 9000 else 0.02,
-            point_shape="circle", point_shading="flat", precision="float16",
-        )  # fmt: skip
+        """The first body in the colours of its errors, a mesh for each step: viser's meshes have one colour."""
+        steps = np.zeros(len(shape.triangles))
+        shown = errors is not None and self.switches.mesh
+        if errors is not None and self.top_mm is not None:
+            steps = np.minimum(errors[shape.triangles].mean(axis=1) / self.top_mm, 1) * (_BANDS - 1)
+        for band in range(_BANDS):
+            path = self._path(figure, f"/errors{band}")
+            chosen = shape.triangles[np.round(steps) == band] if shown else shape.triangles[:0]
+            if not len(chosen):
+                if path in self._nodes:
+                    self._nodes[path].visible = False
+                continue
+            kept, ids = np.unique(chosen, return_inverse=True)
+            vertices, triangles = shape.vertices[kept], ids.reshape(-1, 3).astype(np.uint32)
+            colour = tuple(np.round(255 * error_colours(np.array([float(band)]), _BANDS - 1)[0]).astype(int).tolist())
+            node = self._node(path, lambda path=path, v=vertices, t=triangles, colour=colour: (
+                self._server.scene.add_mesh_simple(path, v, t, color=colour, side="double")))  # fmt: skip
+            node.vertices, node.faces, node.visible = vertices, triangles, True
 
     def _gizmo(self, figure: Figure, shape: Shape) -> None:
         if "gizmo" not in self._nodes:
@@ -212,7 +246,7 @@ class Scene:
         if not visible:
             return
         index = USER_JOINTS.index(self.switches.joint)
-        place = shape.joints[index] + [self._session.offset(figure), 0, 0]
+        place = shape.joints[index] + self._shift + [self._session.offset(figure), 0, 0]
         if np.abs(_matrix(node.wxyz) - shape.turns[index]).max() > 1e-3:
             x, y, z, w = Rotation.from_matrix(shape.turns[index]).as_quat()
             node.wxyz = (w, x, y, z)

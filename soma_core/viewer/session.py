@@ -28,7 +28,7 @@ from soma_core.motion.options import ConvertOptions
 from soma_core.motion.played import Played
 from soma_core.motion.posed_input import PosedInput
 from soma_core.motion.products import write_products
-from soma_core.options import Product, Translation, ViewOptions
+from soma_core.options import Lod, Product, Translation, ViewOptions
 from soma_core.plugin.spec import BackendSpec
 from soma_core.rig import load_canonical
 from soma_core.shape_space.sampling import sample_parameters
@@ -152,11 +152,9 @@ class Session:
         place = self.figures.index(figure) - (len(self.figures) - 1) / 2
         return place * self.spacing
 
-    def layer(self, figure: Figure, *, moving: bool = False) -> SomaLayer:
-        """The layer of a body, as the switches say; that of moving bodies has fewer vertices."""
-        lod = self.options.playing if moving else self.options.lod
-        if self.compared is not None and lod == "xlo":
-            lod = type(lod).low  # whose vertices are among those of mid
+    def layer(self, figure: Figure, lod: Lod | None = None) -> SomaLayer:
+        """The layer of a body, as the switches say."""
+        lod = lod or self.options.lod
         key = (figure.backend, repr(sorted(figure.options.items())), lod, self.procedural, self.correctives)
         if key not in self._layers:
             chosen = self.options.correctives or "auto"
@@ -362,7 +360,7 @@ class Session:
                 self._settle(figure)
 
     def _settle(self, figure: Figure) -> None:
-        layer = self.layer(figure, moving=True)
+        layer = self.layer(figure, Lod.low)
         with torch.no_grad():
             placed = animate(
                 layer, self.identity(figure, layer), figure.motion or self.motion,
@@ -370,33 +368,39 @@ class Session:
             )  # fmt: skip
         figure.path, figure.settled = placed.motion.translation, True
 
-    def played(self, figure: Figure, *, moving: bool = False) -> Played:
+    def played(self, figure: Figure, lod: Lod | None = None) -> Played:
         """The motion on a body, where it stands."""
-        layer, motion = self.layer(figure, moving=moving), figure.motion or self.motion
+        layer, motion = self.layer(figure, lod), figure.motion or self.motion
         if figure.path is None:
             self._settle(figure)
-        stored = {"backend": figure.backend, "params": {}, **({"options": figure.options} if figure.options else {})}
-        stored |= figure.params if "rest" in figure.params else {"params": figure.params}
+        body = figure.params if "rest" in figure.params else {"params": figure.params}
+        own = {"options": figure.options} if figure.options else {}
+        stored = {"backend": figure.backend, "params": {}, **own, **body}
         placed = replace(motion, translation=figure.path, identity=stored)
         return Played(layer=layer, identity=self.identity(figure, layer), motion=placed)
 
     @torch.no_grad()
     def shape(self, figure: Figure, *, moving: bool = False) -> Shape:
-        """A body in the frame that is shown."""
-        layer = self.layer(figure, moving=moving)
+        """A body in the frame that is shown.
+
+        Args:
+            figure: which.
+            moving: with the vertices of moving bodies. Those of ``low`` are some of those of ``mid``.
+        """
+        options, compared = self.options, self.compared is not None
+        lod = options.playing if moving and not (compared and options.playing == Lod.xlo) else options.lod
         if figure.recorded is not None:
             frame = min(self.frame, figure.recorded.frame_count - 1)
-            vertices = figure.recorded.read(frame, frame + 1)[0].astype(np.float32)
-            few = len(vertices) != layer.mesh.vertex_count
-            return Shape(vertices=vertices[layer.mesh.mid_ids] if few else vertices, triangles=layer.mesh.triangles)
-        played = self.played(figure, moving=moving)
-        frame = min(self.frame, played.motion.frame_count - 1)
+            return _of_lod(figure.recorded.read(frame, frame + 1)[0].astype(np.float32), str(lod))
+        whole = Lod.mid if lod == Lod.low and options.lod == Lod.mid else lod
+        played = self.played(figure, whole)
+        layer, frame = played.layer, min(self.frame, played.motion.frame_count - 1)
         pose = [torch.as_tensor(each[frame : frame + 1]).to(layer.device, layer.dtype)
                 for each in (played.motion.rotations, played.motion.translation)]  # fmt: skip
         posed = layer.pose(played.identity, *pose)
         world = posed.transforms[0, 1:, :3, :3].cpu().numpy()
-        return Shape(
-            vertices=posed.vertices[0].cpu().numpy(), triangles=layer.mesh.triangles,
+        return replace(
+            _of_lod(posed.vertices[0].cpu().numpy(), str(lod)),
             joints=posed.joints[0].cpu().numpy(),
             turns=world @ np.swapaxes(layer.rig.t_pose_world[1:, :3, :3], -1, -2),
         )  # fmt: skip
@@ -408,6 +412,13 @@ class Session:
     def write(self, figure: Figure, product: Product, path: Path) -> None:
         """Write the motion on a body as one of the products of ``soma animate``."""
         write_products(self.played(figure), [product], lambda _: path)
+
+
+def _of_lod(vertices: np.ndarray, lod: str) -> Shape:
+    """Vertices on the mesh of a level of detail, which takes some of those of mid."""
+    mesh = load_canonical(lod)[0]
+    kept = vertices if len(vertices) == mesh.vertex_count else vertices[mesh.mid_ids]
+    return Shape(vertices=np.ascontiguousarray(kept), triangles=mesh.triangles)
 
 
 class _Placed(VertexSequence):
