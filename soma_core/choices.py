@@ -179,6 +179,8 @@ class Product(StrEnum):
     glb = "glb"
     html = "html"
     png = "png"
+    mp4 = "mp4"
+    gif = "gif"
     bvh = "bvh"
     joints = "joints"
     csv = "csv"

@@ -86,6 +86,7 @@ __all__ = [
     "Topology",
     "Translation",
     "Upward",
+    "VideoChoice",
     "ViewOptions",
 ]
 
@@ -209,6 +210,38 @@ class Picture(Options):
 
     frames: int = 10
     width: int = 1600
+
+
+@dataclass(kw_only=True)
+class VideoChoice(Options):
+    """A video: its side in pixels, frames per second, and seconds in which a single pose is turned once.
+
+    Of `fps`, None is the motion's, 30 or in a GIF 20 at most.
+    """
+
+    size: int = 720
+    fps: float | None = None
+    seconds: float = 4.0
+
+    def __post_init__(self) -> None:
+        """Refuse what no video has."""
+        super().__post_init__()
+        for name, value, most in (
+            ("size", self.size, 4096),
+            ("fps", self.fps, 240),
+            ("seconds", self.seconds, 600),
+        ):
+            if value is not None and not 0 < value <= most:
+                raise InputError(
+                    f"video.{name}",
+                    got=value,
+                    expected=f"a number above 0, at most {most}",
+                    fix="Leave it out.",
+                )
+        if self.size % 2:
+            raise InputError(
+                "video.size", got=self.size, expected="an even number", fix="Pass video.size=720."
+            )
 
 
 @dataclass(kw_only=True)

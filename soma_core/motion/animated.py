@@ -28,6 +28,7 @@ from soma_core.motion.ground import (
     standing,
 )
 from soma_core.motion.identities import kept_identity
+from soma_core.motion.poses import POSES, named_pose
 from soma_core.motion.questions import Names, of_motion, say
 from soma_core.options import Contacts, FrameRange, Ground, LengthUnit, Translation
 from soma_core.paths import expanded
@@ -78,7 +79,8 @@ def load_clip(
     """Some frames of a motion file.
 
     Args:
-        path: a motion on this skeleton; None for the clip that ships with the project.
+        path: a motion on this skeleton, or the name of a pose as ``T-pose``, see ``soma_core.motion.poses``;
+            None for the clip that ships with the project.
         fps: frame rate, where the file has none.
         person: which sample of a file of several, ``0`` for the first.
         unit: ``m``, ``cm`` or ``mm``, where the file does not say or is wrong.
@@ -88,9 +90,13 @@ def load_clip(
         SomaError: the file cannot be read.
         InputError: no frame is left.
     """
-    path = expanded(path) if path else shipped_file("motions/range_of_motion.npz")
-    motion, frames = read(path, fps=fps, unit=unit, person=person), frames or FrameRange()
-    say(path.name, of_motion(motion, Names(unit="motion_unit", fps="motion_fps", ups=())))
+    frames = frames or FrameRange()
+    if str(path) in POSES:
+        motion = named_pose(str(path))
+    else:
+        path = expanded(path) if path else shipped_file("motions/range_of_motion.npz")
+        motion = read(path, fps=fps, unit=unit, person=person)
+        say(path.name, of_motion(motion, Names(unit="motion_unit", fps="motion_fps", ups=())))
     part = slice(frames.start, frames.stop, frames.step)
     if part.step < 1 or not len(range(motion.frame_count)[part]):
         raise InputError(

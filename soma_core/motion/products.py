@@ -21,19 +21,25 @@ from soma_core.motion.models import model_settings
 from soma_core.motion.options import ConvertOptions
 from soma_core.motion.played import MovingBodies, Played, placing_of
 from soma_core.motion.writers import WRITERS, WriteOptions
-from soma_core.options import BvhChoice, Picture, Product
+from soma_core.options import BvhChoice, Picture, Product, VideoChoice
 from soma_core.skeleton.identity import Identity
 from soma_core.view.picture import backend_colour, contact_sheet
 from soma_core.view.stage import Body
+from soma_core.view.video import write_video
 
 __all__ = [
     "BodyProducts",
     "draw_contact_sheet",
+    "draw_video",
     "write_body",
     "write_bvh_file",
     "write_motion_npz",
     "write_products",
 ]
+
+
+_RATE, _GIF_RATE = 30.0, 20.0
+"""Frames per second of videos, at most where nobody says more."""
 
 
 class BodyProducts:
@@ -85,7 +91,7 @@ class BodyProducts:
             "content": fingerprint(path), **model_settings(layer), "backend": layer.backend,
             "params": stored.get("params"), "options": layer.options, **self._placing,
             "joints": options.joints, "camera": camera, "write_up": options.write_up,
-            "bvh": asdict(options.bvh), "picture": asdict(options.picture),
+            "bvh": asdict(options.bvh), "video": asdict(options.video), "picture": asdict(options.picture),
         }  # fmt: skip
         settings = json.loads(json.dumps(settings, default=str))
         places = {product: files.product(product) for product in options.shown}
@@ -167,6 +173,7 @@ _NEEDED: Mapping[str, Callable[..., tuple[Any, ...]]] = {
     "vertices": lambda _, turned, *__: (turned.meshes(),),
     "body": lambda played, *_: (played.clip(_metadata(played)),),
     "pictures": lambda played, _, __, picture: (played, picture),
+    "video": lambda played, _, options, __: (played, options.video),
 }
 """What each kind of writer takes after the path; a camera sees the world as it is, +Y up."""
 
@@ -188,18 +195,32 @@ def write_bvh_file(path: Path, played: Played, choice: BvhChoice) -> None:
 def draw_contact_sheet(path: Path, played: Played, picture: Picture) -> None:
     """Draw frames of a motion, the middles of equal parts of it: both its ends are often the same pose."""
     count, total = picture.frames, played.motion.frame_count
-    layer, bodies = played.layer, []
-    for frame in np.unique(((np.arange(count) + 0.5) * total / count).astype(int)).tolist():
-        vertices = played.posed(slice(frame, frame + 1))[0].cpu().numpy()
-        bodies.append(
-            Body(
-                vertices=vertices,
-                triangles=layer.mesh.triangles,
-                colour=backend_colour(layer.backend),
-                caption=f"{frame / played.motion.fps:.2f} s",
-            )
-        )
-    contact_sheet(path, bodies, width=picture.width)
+    frames = np.unique(((np.arange(count) + 0.5) * total / count).astype(int)).tolist()
+    contact_sheet(path, [_drawn(played, frame) for frame in frames], width=picture.width)
+
+
+def draw_video(path: Path, played: Played, choice: VideoChoice) -> None:
+    """Draw a motion as a video, a single pose as a turntable."""
+    motion = played.motion
+    rate = choice.fps or min(motion.fps, _GIF_RATE if path.suffix == ".gif" else _RATE)
+    count = max(round(motion.frame_count / motion.fps * rate), 1)
+    frames = np.minimum((np.arange(count) * motion.fps / rate).astype(int), motion.frame_count - 1)
+    if motion.frame_count == 1:
+        rate = choice.fps or _GIF_RATE
+        frames = np.zeros(max(round(choice.seconds * rate), 2), int)
+    places = motion.translation[frames].astype(np.float64)
+    write_video(path, lambda frame: _drawn(played, frame), frames, places, size=choice.size, fps=rate)
+
+
+def _drawn(played: Played, frame: int) -> Body:
+    """The body in a frame, as pictures have it."""
+    layer = played.layer
+    return Body(
+        vertices=played.posed(slice(frame, frame + 1))[0].cpu().numpy(),
+        triangles=layer.mesh.triangles,
+        colour=backend_colour(layer.backend),
+        caption=f"{frame / played.motion.fps:.2f} s",
+    )
 
 
 def _rounded(value: Any) -> Any:

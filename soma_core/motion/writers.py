@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from soma_core.errors import InputError
-from soma_core.options import BvhChoice, Options, Product, Upward
+from soma_core.options import BvhChoice, Options, Product, Upward, VideoChoice
 
 __all__ = ["MESH_WRITERS", "WRITERS", "WriteOptions", "Writer", "listed_writers"]
 
@@ -24,14 +24,14 @@ class Writer:
     Attributes:
         file: what it is called in a folder of its own; without a suffix it is a folder of files.
         needs: of the motion: itself, its rotations on the body's bones, its joints, those before a camera,
-            vertices, mesh and skeleton, or pictures.
+            vertices, mesh and skeleton, pictures, or a video.
         function: ``module:name`` of what writes it; takes the path, and what is needed.
         summary: for people.
         settings: fields of ``WriteOptions`` that it takes.
     """
 
     file: str
-    needs: Literal["motion", "rotations", "joints", "view", "vertices", "body", "pictures"]
+    needs: Literal["motion", "rotations", "joints", "view", "vertices", "body", "pictures", "video"]
     function: str
     summary: str
     settings: tuple[str, ...] = field(default=())
@@ -105,6 +105,14 @@ WRITERS: dict[Product, Writer] = {
         file="contact_sheet.png", needs="pictures", function="soma_core.motion.products:draw_contact_sheet",
         summary="frames of the clip",
     ),
+    Product.mp4: Writer(
+        file="body.mp4", needs="video", function="soma_core.motion.products:draw_video",
+        summary="a video of the clip, of a single pose a turntable", settings=("video",),
+    ),
+    Product.gif: Writer(
+        file="body.gif", needs="video", function="soma_core.motion.products:draw_video",
+        summary="the same for pages that take no video", settings=("video",),
+    ),
 }  # fmt: skip
 """Every product, in the order in which they are written."""
 
@@ -129,22 +137,23 @@ class WriteOptions(Options):
         camera: JSON file of the camera that sees keypoints; see ``soma_core.io.camera``.
         write_up: upward axis of the world of joints and vertices; None: y.
         bvh: of that format.
+        video: of MP4 and GIF.
     """
 
     joints: list[str] | None = None
     camera: str | None = None
     write_up: Upward | None = None
     bvh: BvhChoice = field(default_factory=BvhChoice)
+    video: VideoChoice = field(default_factory=VideoChoice)
 
     def given(self) -> dict[str, str]:
         """The settings that are not as usual, as text."""
         usual, found = WriteOptions.__dataclass_fields__, {}
         for name in usual:
             value = getattr(self, name)
-            if isinstance(value, BvhChoice):
-                changed = {
-                    key: str(each) for key, each in vars(value).items() if each != vars(BvhChoice())[key]
-                }
+            if isinstance(value, Options):
+                plain = vars(type(value)())
+                changed = {key: str(each) for key, each in vars(value).items() if each != plain[key]}
                 value = ", ".join(f"{key}={each}" for key, each in changed.items()) or None
             if value is not None:
                 found[name] = str(value)

@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING
 from omegaconf import OmegaConf
 
 from soma_core.motion.options import ConvertOptions
-from soma_core.viewer.page import Page, close, open_server, serve
+from soma_core.viewer.page import Page
+from soma_core.viewer.server import close, open_server, serve
 from soma_core.viewer.session import Session
 
 if TYPE_CHECKING:

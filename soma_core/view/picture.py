@@ -18,7 +18,7 @@ from soma_core.view.stage import AZIMUTH, PAPER, VIEW_ANGLE, Body, camera_axes, 
 if TYPE_CHECKING:
     from PIL.Image import Image
 
-__all__ = ["backend_colour", "contact_sheet", "gallery", "sheet_width"]
+__all__ = ["backend_colour", "contact_sheet", "framing", "gallery", "sheet_width"]
 
 # The paper's figures: SOMA green, MHR blue, SMPL pink, Anny yellow.
 _COLOURS = {
@@ -75,7 +75,7 @@ def contact_sheet(
     tall = (boxes[:, 1, 1].max() - floor) * 1.12
     wide = sheet_width(len(bodies), width) // columns
     cell = (wide, int(wide * max(tall / reach, 0.9)))
-    rise, height = _framing(bodies, feet, cell[0] / cell[1])
+    rise, height = framing(bodies, feet, cell[0] / cell[1])
     cells = []
     with open_stage(cell) as stage:
         for body, place in zip(bodies, feet + np.array([0, rise, 0]), strict=True):
@@ -85,7 +85,7 @@ def contact_sheet(
     atomic_write(path, lambda target: sheet.save(target, "PNG"))
 
 
-def _framing(bodies: Sequence[Body], feet: np.ndarray, aspect: float) -> tuple[float, float]:
+def framing(bodies: Sequence[Body], feet: np.ndarray, aspect: float) -> tuple[float, float]:
     """Aim the camera so that it sees every body whole, with a margin in which shadows may fade.
 
     A hand near the camera is seen lower than where it is, so the sides of the bodies do not tell.

@@ -24,13 +24,19 @@ PAPER = (0.965, 0.965, 0.96)
 """Colour of the background, sRGB in 0..1."""
 
 VIEW_ANGLE = 18.0
-# A longer lens would be nearer to the paper's figures, but VTK keeps positions for its ambient occlusion in
-# half precision: seen from further away, skin shows rings like those of wood.
+# A longer lens would be nearer to the paper's figures, but then ambient occlusion sees less.
 AZIMUTH = 24.0
 """Degrees by which the camera stands to the side of what it looks at."""
 
 _ELEVATION = 7.0
-_OVERSAMPLING = 3
+_HALF = 2.0**-10
+"""VTK keeps positions for its ambient occlusion in half precision, steps of this share of their distance at
+most. What is nearer to a surface than one of them counts as the surface, or skin shows rings like those of
+wood."""
+
+_OCCLUSION = 0.12
+"""Radius of ambient occlusion [m]."""
+
 _SKIN = {"ambient": 0.24, "diffuse": 0.86, "specular": 0.16, "specular_power": 14}
 _SUN = np.array([0.05, -0.15])
 """Horizontal shift of a shadow for each metre above the floor (x, z)."""
@@ -56,8 +62,16 @@ class Body:
 
 
 @contextmanager
-def open_stage(size: tuple[int, int]) -> Iterator[Stage]:
-    """Off-screen renderer that is closed at the end."""
+def open_stage(size: tuple[int, int], *, oversampling: int = 3) -> Iterator[Stage]:
+    """Off-screen renderer of pictures of a size in pixels, closed at the end.
+
+    Args:
+        size: width and height.
+        oversampling: pixels that are drawn for each, along a side.
+
+    Raises:
+        SomaError: pyvista is not installed.
+    """
     try:
         import pyvista
     except ImportError as error:
@@ -66,7 +80,7 @@ def open_stage(size: tuple[int, int]) -> Iterator[Stage]:
             "(or leave png out of write=[...])."
         ) from error
     with quiet_display():
-        stage = Stage(pyvista, (size[0] * _OVERSAMPLING, size[1] * _OVERSAMPLING))
+        stage = Stage(pyvista, size, oversampling)
     try:
         yield stage
     finally:
@@ -91,8 +105,10 @@ def quiet_display() -> Iterator[None]:
 class Stage:
     """Lights, floor and camera; draws one set of bodies after another."""
 
-    def __init__(self, pyvista: Any, size: tuple[int, int]) -> None:
-        self._pv, self._size = pyvista, size
+    def __init__(self, pyvista: Any, size: tuple[int, int], oversampling: int) -> None:
+        self._pv, self._size, self._oversampling = pyvista, size, oversampling
+        size = (size[0] * oversampling, size[1] * oversampling)
+        self._distance = 0.0
         self._plotter = pyvista.Plotter(off_screen=True, window_size=size, lighting="none")
         self._plotter.set_background(PAPER)
         for position, strength, colour in (
@@ -105,7 +121,6 @@ class Stage:
             )
             light.positional = False
             self._plotter.add_light(light)
-        self._plotter.enable_ssao(radius=0.12, bias=0.004, kernel_size=48)
         self._plotter.show(auto_close=False)  # a plotter that was never shown keeps its first picture
 
     def close(self) -> None:
@@ -136,7 +151,7 @@ class Stage:
         for actor in actors:
             self._plotter.remove_actor(actor, render=False)
         picture = Image.fromarray(np.ascontiguousarray(pixels[..., :3]))
-        return picture.resize([side // _OVERSAMPLING for side in self._size], Image.Resampling.LANCZOS)
+        return picture.resize(self._size, Image.Resampling.LANCZOS)
 
     def _add_body(self, body: Body) -> Any:
         faces = np.insert(body.triangles, 0, 3, axis=1).reshape(-1)
@@ -165,6 +180,10 @@ class Stage:
         camera.view_angle = VIEW_ANGLE
         camera.focal_point, camera.position, camera.up = focus, focus + distance * direction, (0, 1, 0)
         self._plotter.renderer.ResetCameraClippingRange()
+        if abs(distance - self._distance) > 1e-3 * distance:
+            self._distance = distance
+            self._plotter.disable_ssao()
+            self._plotter.enable_ssao(radius=_OCCLUSION, bias=_HALF * distance, kernel_size=48)
 
 
 def camera_axes(azimuth: float) -> np.ndarray:

@@ -1,14 +1,12 @@
-"""The page: its controls, the loop that lets time pass, and the server."""
+"""The page: its controls, and the loop that lets time pass."""
 
 from __future__ import annotations
 
 import contextlib
 import io
-import json
 import logging
 import queue
 import re
-import socket
 import tempfile
 import time
 from collections.abc import Callable
@@ -20,20 +18,19 @@ import numpy as np
 from soma_core.cache import atomic_write
 from soma_core.errors import InputError, SomaError
 from soma_core.io.joint_order import USER_JOINTS
-from soma_core.motion.options import ConvertOptions
+from soma_core.motion.poses import POSES
 from soma_core.motion.questions import heard
 from soma_core.motion.writers import WRITERS
 from soma_core.options import Product, Translation
 from soma_core.plugin.registry import default_registry
 from soma_core.viewer.scene import Scene, Switches
-from soma_core.viewer.session import PRESETS, Figure, Session
+from soma_core.viewer.session import Figure, Session
 from soma_core.viewer.sliders import Controls, ParameterSliders
+from soma_core.viewer.sources import settings_of
 
-__all__ = ["Page", "close", "open_server", "serve", "settings_of"]
+__all__ = ["Page"]
 
 _log = logging.getLogger(__name__)
-
-_NEXT_PORTS = 20
 
 _REST = 0.35
 """Seconds without a change after which bodies are drawn, and brought to the floor, in full."""
@@ -42,7 +39,7 @@ _TOLD = 0.2
 """Seconds between two changes of the slider of time while it plays."""
 
 _PICTURE = (1080, 1920)
-_SPEEDS = {"0.25×": 0.25, "0.5×": 0.5, "1×": 1.0, "2×": 2.0}
+_SPEEDS = {"0.25x": 0.25, "0.5x": 0.5, "1x": 1.0, "2x": 2.0}
 
 
 class Page:
@@ -85,7 +82,9 @@ class Page:
 
     # What is in the panel
 
-    def _add(self, name: str, kind: str, *args: Any, act: Callable[..., None] | None = None, **more: Any) -> Any:
+    def _add(
+        self, name: str, kind: str, *args: Any, act: Callable[..., None] | None = None, **more: Any
+    ) -> Any:
         handle = getattr(self.server.gui, f"add_{kind}")(*args, **more)
         self.handles[name] = handle
         if act is not None:
@@ -96,9 +95,11 @@ class Page:
         with self.server.gui.add_folder("Time"):
             self._add("play", "button", "Play", act=lambda *_: self.play(on=not self.session.playing))
             self._add("frame", "slider", "frame", 0, 1, 1, 0, act=lambda value, _: self.seek(value))
-            self._add("speed", "dropdown", "speed", tuple(_SPEEDS), initial_value="1×",
+            self._add("speed", "dropdown", "speed", tuple(_SPEEDS), initial_value="1x",
                       act=lambda value, _: self._set("speed", _SPEEDS[value]))  # fmt: skip
-            self._add("loop", "checkbox", "loop", True, act=lambda value, _: self._set("loop", value))
+            self._add(
+                "loop", "checkbox", "loop", self.session.loop, act=lambda value, _: self._set("loop", value)
+            )
 
     def _make_body(self, tab: Any) -> None:
         names = default_registry().names()
@@ -108,26 +109,30 @@ class Page:
         self._add("usual", "button_group", "", ("usual", "random", "of motion"), act=self._reshape)
         self._add("search", "text", "search", "", act=lambda value, _: self.sliders.search(value),
                   hint="words in the name of a parameter")  # fmt: skip
-        self.sliders = ParameterSliders(self.server.gui, lambda: tab, self.controls, self._value, self._change)
+        self.sliders = ParameterSliders(
+            self.server.gui, lambda: tab, self.controls, self._value, self._change
+        )
 
     def _make_pose(self, _: Any) -> None:
-        self._add("preset", "dropdown", "pose", tuple(PRESETS), initial_value="arms lowered",
+        self._add("preset", "dropdown", "pose", tuple(POSES), initial_value="arms lowered",
                   act=lambda value, _: self._preset(value))  # fmt: skip
         self._add("joint", "dropdown", "joint", USER_JOINTS, initial_value=self.switches.joint,
                   act=lambda value, _: self._choose_joint(value))  # fmt: skip
-        self._add("gizmo", "checkbox", "rings on the joint", False,
+        self._add("gizmo", "checkbox", "rings on the joint", self.switches.gizmo,
                   act=lambda value, _: self._switch("gizmo", value))  # fmt: skip
         for axis in "xyz":
             self._add(f"turn_{axis}", "slider", f"about {axis}, °", -180.0, 180.0, 1.0, 0.0,
                       act=lambda *_: self._turn_sliders())  # fmt: skip
         self._add("straight", "button", "joint as in the T-pose", act=lambda *_: self._straighten())
-        self.server.gui.add_markdown("Turns the joint in the frame that is shown; click one with the skeleton on.")
+        self.server.gui.add_markdown(
+            "Turns the joint in the frame that is shown; click one with the skeleton on."
+        )
 
     def _make_motion(self, _: Any) -> None:
         self.handles["about"] = self.server.gui.add_markdown("")
         self._add("path", "text", "file", "", hint="on the machine where soma view runs")
         self._add("settings", "text", "settings", "",
-                  hint="as of soma convert, where the file does not say: fps=30 unit=cm up=z person=0")  # fmt: skip
+                  hint="of soma convert, where the file does not say: fps=30 unit=cm up=z")  # fmt: skip
         self._add("load", "button_group", "", ("load", "compare"), act=lambda what, _: self._load(what))
         self._add("upload", "upload_button", "Upload a motion", act=lambda file, _: self._upload(file))
         self._add("translation", "dropdown", "stands", tuple(map(str, Translation)),
@@ -216,7 +221,9 @@ class Page:
         self.switches.joint = self.handles["joint"].value = joint
 
     def _turn_sliders(self) -> None:
-        self.session.turn(self.switches.joint, np.array([self.handles[f"turn_{axis}"].value for axis in "xyz"]))
+        self.session.turn(
+            self.switches.joint, np.array([self.handles[f"turn_{axis}"].value for axis in "xyz"])
+        )
 
     def _turn_gizmo(self, turn: np.ndarray) -> None:
         if self.session.figures:
@@ -403,98 +410,3 @@ class Page:
         except Exception as error:  # a defect: the page that someone works in goes on
             _log.exception("a defect")
             self.tell("A defect", f"{type(error).__name__}: {error}", colour="red")
-
-
-def settings_of(text: str) -> ConvertOptions:
-    """Settings of a conversion from ``key=value key=value``.
-
-    Raises:
-        InputError: one that there is not, or a value that it has not.
-    """
-    given: dict[str, Any] = {}
-    for word in text.split():
-        key, sign, value = word.partition("=")
-        if not sign or key not in ConvertOptions.__dataclass_fields__:
-            raise InputError(
-                "settings", got=word, expected="settings of soma convert, as fps=30 or unit=cm",
-                fix="Correct the word, or take it out.",
-            )  # fmt: skip
-        try:
-            given[key] = json.loads(value)
-        except ValueError:
-            given[key] = value
-    return ConvertOptions(**given)
-
-
-def open_server(host: str, port: int) -> Any:
-    """Start viser at an address, or at the next port that is free.
-
-    Raises:
-        SomaError: viser is not installed.
-        InputError: no such address of this machine, or none of the ports is free.
-    """
-    try:
-        import viser
-    except ImportError as error:
-        raise SomaError(
-            "soma view needs viser, which is not installed. Run: pip install 'soma-body-core[view]'."
-        ) from error
-    found = _free_port(host, port)
-    if found != port and port:
-        _log.info("port %d is taken; this is the next", port)
-    with contextlib.redirect_stdout(io.StringIO()):  # its own banner
-        return viser.ViserServer(host=host, port=found, verbose=False)
-
-
-def _free_port(host: str, port: int) -> int:
-    for number in range(port, min(port + _NEXT_PORTS, 65536)) if port else (0,):
-        try:
-            place = socket.getaddrinfo(host, number, type=socket.SOCK_STREAM)[0]
-            with socket.socket(place[0], place[1]) as one:
-                one.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-                one.bind(place[4])
-                return int(one.getsockname()[1])
-        except PermissionError as error:
-            raise InputError("port", got=port, expected="one that may be used", fix="Pass port=8080.") from error
-        except (socket.gaierror, OSError) as error:
-            if isinstance(error, socket.gaierror) or error.errno in (98, 48, 10048):
-                if isinstance(error, socket.gaierror):
-                    raise _no_host(host) from error
-                continue
-            raise _no_host(host) from error
-    raise InputError(
-        "port", got=f"{port} and the next {_NEXT_PORTS - 1}, all taken", expected="a free one",
-        fix="Pass port=9000, or port=0 for any.",
-    )  # fmt: skip
-
-
-def _no_host(host: str) -> InputError:
-    return InputError(
-        "host", got=host, expected="an address of this machine",
-        fix="Leave it out for this machine alone, or pass host=0.0.0.0 for all of its addresses.",
-    )  # fmt: skip
-
-
-def close(server: Any) -> None:
-    """End a server without its own words."""
-    with contextlib.redirect_stdout(io.StringIO()):
-        server.stop()
-
-
-def serve(page: Page) -> None:
-    """Serve until Ctrl-C."""
-    server = page.server
-    host, port = server.get_host(), server.get_port()
-    address = "localhost" if host in ("0.0.0.0", "::") else host  # noqa: S104 - asked for
-    if address != host:
-        _log.warning("host=%s: everybody who reaches this machine can use the page and read motions here", host)
-    try:
-        page.step(0)
-        _log.info("open http://%s:%d in a browser; Ctrl-C ends", address, port)
-        while True:
-            page.watched = bool(server.get_clients())
-            page.step()
-    except KeyboardInterrupt:
-        _log.info("ended")
-    finally:
-        close(server)

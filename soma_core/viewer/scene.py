@@ -16,10 +16,9 @@ from soma_core.viewer.session import Figure, Session, Shape
 
 __all__ = ["Scene", "Switches"]
 
-_BONES = np.array([
-    (USER_JOINTS.index(parent), index) for index, parent in enumerate(PARENT_NAMES.values()) if parent in USER_JOINTS
-])  # fmt: skip
-_BONE, _JOINT, _CHOSEN = (38, 70, 140), (240, 190, 60), (214, 60, 50)
+_BONES = np.array([(USER_JOINTS.index(parent), USER_JOINTS.index(joint))
+                   for joint, parent in PARENT_NAMES.items() if parent in USER_JOINTS])  # fmt: skip
+_BONE, _JOINT = (38, 70, 140), (240, 190, 60)
 _GHOST = 0.45
 """Opacity of skin through which bones are seen."""
 
@@ -30,7 +29,7 @@ _GIZMO = 0.16
 """Radius of the rings that turn a joint [m]."""
 
 _SECTION, _SINK = 1.0, 0.004
-"""Squares of the floor, and how far it lies below the soles that stand, which give by a few millimetres [m]."""
+"""Squares of the floor, and how far it lies below soles that stand, which give by some millimetres [m]."""
 
 
 @dataclass
@@ -76,7 +75,8 @@ class Scene:
         scene.configure_environment_map("studio", environment_intensity=0.5)
         self._shift = np.zeros(3)
         self._floor = scene.add_grid(
-            "/floor", plane="xz", infinite_grid=True, cell_size=_SECTION / 4, section_size=_SECTION, fade_distance=14.0,
+            "/floor", plane="xz", infinite_grid=True, cell_size=_SECTION / 4, section_size=_SECTION,
+            fade_distance=14.0,
             cell_color=(226, 226, 222), section_color=(200, 200, 196), shadow_opacity=0.3,
             plane_color=(246, 246, 244), plane_opacity=1.0, position=(0, -_SINK, 0),
         )  # fmt: skip
@@ -99,8 +99,8 @@ class Scene:
                 first = figure is session.figures[0]
                 shown = switches.mesh and not (first and errors is not None)
                 root = self._root(figure)
-                root.position = self._shift + [session.offset(figure), 0, 0]
-                self._mesh(figure, shape, visible=shown, moving=moving)
+                root.position = self._shift + np.array([session.offset(figure), 0, 0])
+                self._mesh(figure, shape, visible=shown)
                 self._bones(figure, shape)
                 self._names(figure, shape, visible=switches.names and first)
                 self._title(figure, shape)
@@ -112,7 +112,7 @@ class Scene:
         """Keep the first body in the middle, and let the floor pass under it."""
         hips = shapes[0].joints[0] if shapes and shapes[0].joints is not None else np.zeros(3)
         self._shift = -hips * [1, 0, 1] if self.switches.follow else np.zeros(3)
-        self._floor.position = np.fmod(self._shift, _SECTION) + [0, -_SINK, 0]
+        self._floor.position = np.fmod(self._shift, _SECTION) - np.array([0, _SINK, 0])
 
     def _node(self, key: str, make: Callable[[], Any]) -> Any:
         if key not in self._nodes:
@@ -136,7 +136,7 @@ class Scene:
         path = self._path(figure)
         return self._node(path, lambda: self._server.scene.add_frame(path, show_axes=False))
 
-    def _mesh(self, figure: Figure, shape: Shape, *, visible: bool, moving: bool) -> None:
+    def _mesh(self, figure: Figure, shape: Shape, *, visible: bool) -> None:
         """One node for each level of detail: vertices and triangles of one change together."""
         own = self._path(figure, f"/skin{len(shape.vertices)}")
         for path, node in self._nodes.items():
@@ -171,11 +171,14 @@ class Scene:
     def _dots(self, path: str, joints: np.ndarray) -> Any:
         """Joints that can be clicked: small octahedra, smaller in hands and face."""
         corners = 0.012 * np.concatenate([np.eye(3), -np.eye(3)]).astype(np.float32)
-        faces = np.array([(0, 1, 2), (1, 3, 2), (3, 4, 2), (4, 0, 2), (1, 0, 5), (3, 1, 5), (4, 3, 5), (0, 4, 5)])
+        faces = np.array(
+            [(0, 1, 2), (1, 3, 2), (3, 4, 2), (4, 0, 2), (1, 0, 5), (3, 1, 5), (4, 3, 5), (0, 4, 5)]
+        )
         small = [0.4 if "Hand" in name and name[-1] in "1234d" else 1.0 for name in USER_JOINTS]
         node = self._server.scene.add_batched_meshes_simple(
             path, corners, faces, np.tile([1.0, 0, 0, 0], (len(joints), 1)), joints, lod="off",
-            batched_scales=np.array(small, np.float32), batched_colors=_JOINT, flat_shading=True, cast_shadow=False,
+            batched_scales=np.array(small, np.float32), batched_colors=_JOINT, flat_shading=True,
+            cast_shadow=False,
         )  # fmt: skip
 
         @node.on_click
@@ -199,7 +202,9 @@ class Scene:
     def _title(self, figure: Figure, shape: Shape) -> None:
         """Whose body it is, above the head, where there are several."""
         path = self._path(figure, "/title")
-        node = self._node(path, lambda: self._server.scene.add_label(path, figure.name, anchor="bottom-center"))
+        node = self._node(
+            path, lambda: self._server.scene.add_label(path, figure.name, anchor="bottom-center")
+        )
         node.visible = len(self._session.figures) > 1 and self._session.spacing > 0
         if node.visible:
             top = shape.vertices[shape.vertices[:, 1].argmax()]
@@ -215,7 +220,7 @@ class Scene:
         return errors
 
     def _painted(self, figure: Figure, shape: Shape, errors: np.ndarray | None) -> None:
-        """The first body in the colours of its errors, a mesh for each step: viser's meshes have one colour."""
+        """The first body in the colours of its errors: a mesh for each, since one has one colour."""
         steps = np.zeros(len(shape.triangles))
         shown = errors is not None and self.switches.mesh
         if errors is not None and self.top_mm is not None:
@@ -229,7 +234,9 @@ class Scene:
                 continue
             kept, ids = np.unique(chosen, return_inverse=True)
             vertices, triangles = shape.vertices[kept], ids.reshape(-1, 3).astype(np.uint32)
-            colour = tuple(np.round(255 * error_colours(np.array([float(band)]), _BANDS - 1)[0]).astype(int).tolist())
+            colour = tuple(
+                np.round(255 * error_colours(np.array([float(band)]), _BANDS - 1)[0]).astype(int).tolist()
+            )
             node = self._node(path, lambda path=path, v=vertices, t=triangles, colour=colour: (
                 self._server.scene.add_mesh_simple(path, v, t, color=colour, side="double")))  # fmt: skip
             node.vertices, node.faces, node.visible = vertices, triangles, True
@@ -237,7 +244,12 @@ class Scene:
     def _gizmo(self, figure: Figure, shape: Shape) -> None:
         if "gizmo" not in self._nodes:
             node = self._server.scene.add_transform_controls(
-                "/gizmo", scale=_GIZMO, disable_axes=True, disable_sliders=True, depth_test=False, visible=False
+                "/gizmo",
+                scale=_GIZMO,
+                disable_axes=True,
+                disable_sliders=True,
+                depth_test=False,
+                visible=False,
             )
             node.on_update(lambda event: self._turned(_matrix(event.target.wxyz)))
             self._nodes["gizmo"] = node

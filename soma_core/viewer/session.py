@@ -16,46 +16,25 @@ from soma_core.errors import InputError
 from soma_core.geometry.rotations import axis_angle_to_matrix
 from soma_core.io.joint_order import USER_JOINTS
 from soma_core.io.motion import Motion
-from soma_core.io.vertex_files import open_vertex_sequence
 from soma_core.io.vertex_sequence import VertexSequence
 from soma_core.layer import SomaLayer
 from soma_core.motion.animated import animate
 from soma_core.motion.conversion import convert
-from soma_core.motion.files import layout_of
 from soma_core.motion.identities import stored_identity
-from soma_core.motion.models import TransferredSequence, open_layer
+from soma_core.motion.models import open_layer
 from soma_core.motion.options import ConvertOptions
 from soma_core.motion.played import Played
-from soma_core.motion.posed_input import PosedInput
+from soma_core.motion.poses import named_pose
 from soma_core.motion.products import write_products
 from soma_core.options import Lod, Product, Translation, ViewOptions
-from soma_core.plugin.spec import BackendSpec
 from soma_core.rig import load_canonical
 from soma_core.shape_space.sampling import sample_parameters
 from soma_core.skeleton.identity import Identity
-from soma_core.topology.frames import METRES, native_to_canonical
+from soma_core.viewer.sources import holds_motion, recorded
 
-__all__ = ["PRESETS", "Figure", "Session", "Shape", "new_motion"]
+__all__ = ["Figure", "Session", "Shape"]
 
 _log = logging.getLogger(__name__)
-
-_LOWERED = {"LeftArm": (0, 0, -72), "LeftForeArm": (0, -12, 0)}
-_SEATED = {"LeftLeg": (-82, 8, 4), "LeftShin": (86, 0, 0), "LeftFoot": (-4, 0, 0)}
-
-PRESETS: dict[str, dict[str, tuple[float, float, float]]] = {
-    "T-pose": {},
-    "arms lowered": _LOWERED,
-    "A-pose": {"LeftArm": (0, 0, -45)},
-    "arms raised": {"LeftShoulder": (0, 0, 14), "LeftArm": (0, 0, 62)},
-    "squat": {**_SEATED, "Spine1": (14, 0, 0), "LeftFoot": (-14, 0, 0), "LeftArm": (0, -72, 8)},
-    "seated": {**_SEATED, **_LOWERED},
-    "stride": {
-        "LeftLeg": (-28, 0, 0), "LeftShin": (12, 0, 0), "RightLeg": (22, 0, 0), "RightShin": (28, 0, 0),
-        "LeftArm": (0, 24, -68), "RightArm": (0, 24, 68), "LeftForeArm": (0, -22, 0), "RightForeArm": (0, 34, 0),
-    },
-}  # fmt: skip
-"""Poses by name: rotation vectors [degrees] of joints, from the T-pose in world axes. A joint of the left
-whose right twin is not named stands for both."""
 
 _AT_ONCE = 64
 """Frames that are brought to the floor while a slider moves; longer clips are when it rests."""
@@ -116,7 +95,7 @@ class Session:
     def __init__(self, options: ViewOptions, *, translation: Translation = Translation.ground) -> None:
         self.options, self.translation = options, translation
         self.figures: list[Figure] = []
-        self.motion = new_motion("arms lowered")
+        self.motion = named_pose("arms lowered")
         self.place = 0.0
         self.playing, self.loop, self.speed = False, True, 1.0
         self.procedural, self.correctives = options.procedural, options.correctives is not None
@@ -253,11 +232,11 @@ class Session:
             raise InputError("compare", got="no body", expected="one", fix="Add a body.")
         first = self.figures[0]
         other = Figure(name="compared", backend=first.backend, options=first.options, params=first.params)
-        if _holds_motion(Path(path)):
+        if holds_motion(Path(path)):
             other.motion = self._relative(convert(path, options=settings))
             self._own_body(other, other.motion)
         else:
-            other.recorded = self._sequence(first, Path(path), settings or ConvertOptions())
+            other.recorded = recorded(Path(path), self.layer(first), settings or ConvertOptions())
         self.figures, self.translation, self.spacing = [first, other], Translation.motion, 0.0
         first.path, first.settled = None, False
         return other
@@ -286,15 +265,6 @@ class Session:
         self._own_body(figure, self.motion)
         figure.path = None
 
-    def _sequence(self, figure: Figure, path: Path, settings: ConvertOptions) -> VertexSequence:
-        """Vertices of a file on the canonical mesh [m], +Y up."""
-        sequence = open_vertex_sequence(
-            path, fps=settings.fps, unit=settings.unit_name, up=settings.upward
-        )  # fmt: skip
-        posed = PosedInput(sequence, self.layer(figure), topology="auto")
-        placed = _Placed(sequence, posed, self.layer(figure).spec)
-        return placed if posed.topology == "canonical" else TransferredSequence(placed, figure.backend)
-
     def _relative(self, motion: Motion) -> Motion:
         """The motion with rotations against the T-pose, in arrays of its own that a pose changes."""
         rotations = np.array(motion.rotations)
@@ -322,8 +292,8 @@ class Session:
     # Pose
 
     def preset(self, name: str) -> None:
-        """Show a pose of `PRESETS` in place of the motion."""
-        self.show(new_motion(name))
+        """Show a pose of `POSES` in place of the motion."""
+        self.show(named_pose(name))
 
     def rotation(self, joint: str) -> np.ndarray:
         """Rotation vector (3,) [degrees] of a joint in this frame, from the T-pose in world axes."""
@@ -353,10 +323,10 @@ class Session:
 
     def settle(self, *, rest: bool) -> None:
         """Bring bodies to where they stand, those of long clips where the sliders rest."""
+        short = self.frame_count <= _AT_ONCE
         for figure in self.figures:
-            if figure.recorded is None and (figure.path is None or (not figure.settled and rest)):
-                self._settle(figure)
-            elif not figure.settled and self.frame_count <= _AT_ONCE and figure.recorded is None:
+            stale = figure.path is None or (not figure.settled and (rest or short))
+            if stale and figure.recorded is None:
                 self._settle(figure)
 
     def _settle(self, figure: Figure) -> None:
@@ -419,46 +389,3 @@ def _of_lod(vertices: np.ndarray, lod: str) -> Shape:
     mesh = load_canonical(lod)[0]
     kept = vertices if len(vertices) == mesh.vertex_count else vertices[mesh.mid_ids]
     return Shape(vertices=np.ascontiguousarray(kept), triangles=mesh.triangles)
-
-
-class _Placed(VertexSequence):
-    """Vertices of a sequence in metres, +Y up, whatever the mesh."""
-
-    def __init__(self, sequence: VertexSequence, posed: PosedInput, spec: BackendSpec) -> None:
-        count = posed.read(0, 1).shape[1]
-        super().__init__(sequence.path, sequence.frame_count, count, fps=sequence.fps, metres=1.0, up="+y")
-        native = native_to_canonical(spec.up, spec.forward) * METRES[spec.unit]
-        self._posed, self._axes = posed, np.eye(3) if posed.topology == "canonical" else native
-
-    def _read(self, start: int, stop: int) -> np.ndarray:
-        return np.ascontiguousarray(self._posed.read(start, stop) @ self._axes.T)
-
-
-def _holds_motion(path: Path) -> bool:
-    """Whether a file is a motion rather than vertices over time."""
-    if path.is_dir() or path.suffix.lower() == ".npy":
-        return False
-    if path.suffix.lower() in (".glb", ".usd", ".usda", ".usdc", ".usdz"):
-        return False
-    return layout_of(path) is not None
-
-
-def new_motion(name: str) -> Motion:
-    """One frame of a pose of `PRESETS`.
-
-    Raises:
-        InputError: no such pose.
-    """
-    if name not in PRESETS:
-        raise InputError("pose", got=name, expected=f"one of {', '.join(PRESETS)}", fix="Choose one.")
-    angles = dict(PRESETS[name])
-    for joint, (x, y, z) in list(angles.items()):
-        twin = joint.replace("Left", "Right")
-        angles.setdefault(twin, (x, -y, -z))
-    vectors = np.zeros((1, len(USER_JOINTS), 3))
-    for joint, degrees in angles.items():
-        vectors[0, USER_JOINTS.index(joint)] = np.radians(degrees)
-    rotations = axis_angle_to_matrix(torch.as_tensor(vectors)).numpy()
-    return Motion(
-        rotations=rotations, translation=np.array([[0.0, 1.0, 0.0]]), fps=30.0, joint_names=USER_JOINTS, source=name
-    )  # fmt: skip

@@ -37,6 +37,11 @@ def _label(entry: Entry) -> str:
     return parameter.name if index is None else f"{parameter.name} {index}"
 
 
+def _about(entry: Entry) -> str:
+    """What a search looks at."""
+    return f"{_label(entry)} {entry[0].group} {entry[0].description}".lower()
+
+
 class Controls:
     """Ties controls of viser to what they do; what the page itself sets does nothing.
 
@@ -100,22 +105,27 @@ class ParameterSliders:
             if shown:
                 self._folder(heading, entries[:shown], self._folders, opened=True)
             if entries[shown:]:
-                self._folder(f"{heading}: {len(entries) - shown} more", entries[shown:], self._folders, opened=False)
+                self._folder(
+                    f"{heading}: {len(entries) - shown} more", entries[shown:], self._folders, opened=False
+                )
 
     def search(self, text: str) -> int:
         """Show the sliders whose name or description has each of some words; return how many there are."""
         for folder in self._found:
             folder.remove()
-        kept = {key: [each for each in handles if not each._impl.removed] for key, handles in self.handles.items()}
+        kept = {
+            key: [each for each in handles if not each._impl.removed] for key, handles in self.handles.items()
+        }
         self._found, self.handles = [], kept
         words = text.lower().split()
         if not words or self._spec is None:
             return 0
-        every = [entry for entries in entries_of(self._spec).values() for entry in entries]
         found = [
-            entry for entry in every
-            if all(word in f"{_label(entry)} {entry[0].group} {entry[0].description}".lower() for word in words)
-        ]  # fmt: skip
+            (parameter, index)
+            for entries in entries_of(self._spec).values()
+            for parameter, index in entries
+            if all(word in _about((parameter, index)) for word in words)
+        ]
         title = f"{len(found)} found" + (f", the first {_FOUND}" if len(found) > _FOUND else "")
         self._folder(title, found[:_FOUND], self._found, opened=True, order=-1.0)
         return len(found)
