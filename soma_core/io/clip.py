@@ -242,7 +242,7 @@ def _continuous(rotations: np.ndarray) -> np.ndarray:
     flat = Rotation.from_matrix(rotations.reshape(-1, 3, 3)).as_quat(canonical=True)
     quaternions = flat.reshape(*rotations.shape[:2], 4)
     flips = (quaternions[1:] * quaternions[:-1]).sum(-1) < 0
-    signs = np.concatenate([np.ones_like(flips[:1], float), np.where(flips, -1.0, 1.0)])[: len(quaternions)]
+    signs = np.concatenate([np.ones_like(quaternions[:1, :, 0]), np.where(flips, -1.0, 1.0)])
     return quaternions * np.cumprod(signs, axis=0)[..., None]
 
 

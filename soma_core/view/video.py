@@ -23,7 +23,7 @@ _ENCODERS = {
     ".gif": ["-filter_complex", "split[a][b];[a]palettegen=stats_mode=single[p];"
              "[b][p]paletteuse=new=1:dither=none", "-loop", "0", "-f", "gif"],
 }  # fmt: skip
-"""What ffmpeg is told after its input, by suffix. A palette for each frame: one for all keeps all in memory."""
+"""What ffmpeg is told after its input, by suffix. One palette for all frames would keep all in memory."""
 
 _NARROW = 2.5
 """Width of a path that one still camera sees [m]; along a longer one it goes with the body."""

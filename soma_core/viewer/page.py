@@ -18,7 +18,7 @@ import numpy as np
 from soma_core.cache import atomic_write
 from soma_core.errors import InputError, SomaError
 from soma_core.io.joint_order import USER_JOINTS
-from soma_core.motion.poses import POSES
+from soma_core.motion.poses import POSES, named_pose
 from soma_core.motion.questions import heard
 from soma_core.motion.writers import WRITERS
 from soma_core.options import Product, Translation
@@ -31,6 +31,8 @@ from soma_core.viewer.sources import settings_of
 __all__ = ["Page"]
 
 _log = logging.getLogger(__name__)
+
+_Act = Callable[..., None] | None
 
 _REST = 0.35
 """Seconds without a change after which bodies are drawn, and brought to the floor, in full."""
@@ -82,9 +84,7 @@ class Page:
 
     # What is in the panel
 
-    def _add(
-        self, name: str, kind: str, *args: Any, act: Callable[..., None] | None = None, **more: Any
-    ) -> Any:
+    def _add(self, name: str, kind: str, *args: Any, act: _Act = None, **more: Any) -> Any:
         handle = getattr(self.server.gui, f"add_{kind}")(*args, **more)
         self.handles[name] = handle
         if act is not None:
@@ -97,9 +97,7 @@ class Page:
             self._add("frame", "slider", "frame", 0, 1, 1, 0, act=lambda value, _: self.seek(value))
             self._add("speed", "dropdown", "speed", tuple(_SPEEDS), initial_value="1x",
                       act=lambda value, _: self._set("speed", _SPEEDS[value]))  # fmt: skip
-            self._add(
-                "loop", "checkbox", "loop", self.session.loop, act=lambda value, _: self._set("loop", value)
-            )
+            self._add("loop", "checkbox", "loop", self.session.loop, act=lambda on, _: self._set("loop", on))
 
     def _make_body(self, tab: Any) -> None:
         names = default_registry().names()
@@ -122,18 +120,17 @@ class Page:
                   act=lambda value, _: self._switch("gizmo", value))  # fmt: skip
         for axis in "xyz":
             self._add(f"turn_{axis}", "slider", f"about {axis}, °", -180.0, 180.0, 1.0, 0.0,
-                      act=lambda *_: self._turn_sliders())  # fmt: skip
-        self._add("straight", "button", "joint as in the T-pose", act=lambda *_: self._straighten())
-        self.server.gui.add_markdown(
-            "Turns the joint in the frame that is shown; click one with the skeleton on."
-        )
+                      act=lambda *_: self._turn())  # fmt: skip
+        self._add("straight", "button", "joint as in the T-pose", act=lambda *_: self._turn(np.zeros(3)))
+        self.server.gui.add_markdown("Turns it in the frame that is shown; with the skeleton on, click one.")
 
     def _make_motion(self, _: Any) -> None:
         self.handles["about"] = self.server.gui.add_markdown("")
         self._add("path", "text", "file", "", hint="on the machine where soma view runs")
         self._add("settings", "text", "settings", "",
                   hint="of soma convert, where the file does not say: fps=30 unit=cm up=z")  # fmt: skip
-        self._add("load", "button_group", "", ("load", "compare"), act=lambda what, _: self._load(what))
+        self._add("load", "button_group", "", ("load", "compare"), act=lambda what, _: self.load(
+            Path(self.handles["path"].value), compare=what == "compare"))  # fmt: skip
         self._add("upload", "upload_button", "Upload a motion", act=lambda file, _: self._upload(file))
         self._add("translation", "dropdown", "stands", tuple(map(str, Translation)),
                   initial_value=str(self.session.translation), act=lambda value, _: self._stand(value),
@@ -213,35 +210,25 @@ class Page:
             self.sliders.refresh()
 
     def _preset(self, name: str) -> None:
-        self.session.preset(name)
+        self.session.show(named_pose(name))
         self._show_figures()
         self._show_motion()
 
     def _choose_joint(self, joint: str) -> None:
         self.switches.joint = self.handles["joint"].value = joint
 
-    def _turn_sliders(self) -> None:
-        self.session.turn(
-            self.switches.joint, np.array([self.handles[f"turn_{axis}"].value for axis in "xyz"])
-        )
+    def _turn(self, vector: np.ndarray | None = None) -> None:
+        """Turn the joint, without a vector as the sliders say."""
+        told = np.array([self.handles[f"turn_{axis}"].value for axis in "xyz"])
+        self.session.turn(self.switches.joint, told if vector is None else vector)
 
     def _turn_gizmo(self, turn: np.ndarray) -> None:
-        if self.session.figures:
-            self.session.turn_in_world(self.session.figures[0], self.switches.joint, turn)
-
-    def _straighten(self) -> None:
-        self.session.turn(self.switches.joint, np.zeros(3))
+        self.session.turn_in_world(self.session.figures[0], self.switches.joint, turn)
 
     def _stand(self, translation: str) -> None:
         self.session.translation = Translation(translation)
         for figure in self.session.figures:
             figure.path = None
-
-    def _load(self, what: str) -> None:
-        text = self.handles["path"].value.strip()
-        if not text:
-            raise InputError("file", got="nothing", expected="the path of a motion", fix="Type it above.")
-        self.load(Path(text), compare=what == "compare")
 
     def load(self, path: Path, *, compare: bool = False) -> None:
         """Move the bodies by a file, or compare the first with it.
@@ -249,6 +236,8 @@ class Page:
         Raises:
             SomaError: it cannot be used.
         """
+        if path == Path():
+            raise InputError("file", got="nothing", expected="the path of a motion", fix="Type it above.")
         settings = settings_of(self.handles["settings"].value)
         with self._busy(f"reading {path.name}"), heard() as said:
             (self.session.compare if compare else self.session.load)(path, settings)

@@ -291,10 +291,6 @@ class Session:
 
     # Pose
 
-    def preset(self, name: str) -> None:
-        """Show a pose of `POSES` in place of the motion."""
-        self.show(named_pose(name))
-
     def rotation(self, joint: str) -> np.ndarray:
         """Rotation vector (3,) [degrees] of a joint in this frame, from the T-pose in world axes."""
         turn = self.motion.rotations[self.frame, USER_JOINTS.index(joint)]
