@@ -40,8 +40,7 @@ _REST = 0.35
 _TOLD = 0.2
 """Seconds between two changes of the slider of time while it plays."""
 
-_PICTURE = (1080, 1920)
-_SPEEDS = {"0.25x": 0.25, "0.5x": 0.5, "1x": 1.0, "2x": 2.0}
+_PICTURE, _SPEEDS = (1080, 1920), {"0.25x": 0.25, "0.5x": 0.5, "1x": 1.0, "2x": 2.0}
 
 
 class Page:

@@ -71,6 +71,10 @@ class Scene:
         self.top_mm: float | None = None
         scene = server.scene
         scene.set_up_direction("+y")
+        wide = session.spacing * max(len(session.figures) - 1, 0)
+        camera = server.initial_camera  # before all that is large: a browser takes it as long as it waits
+        camera.position, camera.look_at = (1.6, 1.5, 3.5 + 1.2 * wide), (0.25 + 0.1 * wide, 0.86, 0.0)
+        camera.up, camera.fov = (0.0, 1.0, 0.0), np.radians(34)
         scene.world_axes.visible = False
         scene.configure_environment_map("studio", environment_intensity=0.5)
         self._shift = np.zeros(3)
@@ -80,7 +84,6 @@ class Scene:
             cell_color=(226, 226, 222), section_color=(200, 200, 196), shadow_opacity=0.3,
             plane_color=(246, 246, 244), plane_opacity=1.0, position=(0, -_SINK, 0),
         )  # fmt: skip
-        server.initial_camera.up, server.initial_camera.fov = (0.0, 1.0, 0.0), np.radians(34)
 
     def draw(self, *, moving: bool) -> None:
         """Bring the scene to what the session shows.
@@ -125,9 +128,6 @@ class Scene:
             if not getattr(node, "_impl").removed:  # noqa: B009 - a parent takes its children along
                 node.remove()
         self._figures = list(self._session.figures)
-        wide = self._session.spacing * (len(self._figures) - 1)
-        camera = self._server.initial_camera  # of browsers that come from now on; the panel is to the right
-        camera.position, camera.look_at = (1.6, 1.5, 3.5 + 1.2 * wide), (0.25 + 0.1 * wide, 0.86, 0.0)
 
     def _path(self, figure: Figure, part: str = "") -> str:
         return f"/body{self._session.figures.index(figure)}{part}"

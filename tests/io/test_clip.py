@@ -28,6 +28,15 @@ def test_quaternions_do_not_flip_between_frames(clip):
     assert ((clip.quaternions[1:] * clip.quaternions[:-1]).sum(-1) > 0).all()
 
 
+def test_a_single_pose_is_a_clip_as_well():
+    layer = SomaLayer("soma", lod="low")
+    identity = layer.identity()
+    posed = layer.pose(identity, torch.zeros(1, 77, 3))
+    clip = skinned_clip(layer.mesh, layer.rig, identity, posed.transforms, fps=30)
+    assert clip.quaternions.shape == (1, layer.rig.joint_count, 4)
+    assert "influences" in clip.limits
+
+
 def test_only_the_hips_move_along(clip):
     bones = np.ptp(clip.translations, axis=0).max(axis=1)
     assert np.flatnonzero(bones).tolist() == [1]

@@ -92,7 +92,7 @@ def test_controls_do_what_they_say(page):
     handles["correctives"].value = False
     settle(page, until=lambda: not session.correctives and page.switches.gizmo)
     nodes = page.scene._nodes
-    assert nodes["/body0/bones"].visible and nodes["/body0/name0"].visible and nodes["gizmo"].visible
+    assert all(nodes[name].visible for name in ("/body0/bones", "/body0/name0", "gizmo"))
     place = page.session.shape(session.figures[0]).joints[13] + page.scene._shift
     np.testing.assert_allclose(nodes["gizmo"].position, place, atol=1e-4)
 

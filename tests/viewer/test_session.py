@@ -148,7 +148,7 @@ def test_a_result_is_as_near_to_itself_as_numbers_are(session, clip, tmp_path, k
     session.place = 2.0
     errors = session.errors_mm(*map(session.shape, session.figures))
     assert errors.max() < SAME_MM
-    session.turn("LeftForeArm", session.rotation("LeftForeArm") + [0, -20, 0])
+    session.turn("LeftForeArm", session.rotation("LeftForeArm") - np.array([0, 20, 0]))
     shape, there = map(session.shape, session.figures)
     errors = session.errors_mm(shape, there)
     assert errors.max() > 50
