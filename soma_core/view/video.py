@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import itertools
 import subprocess
-from collections.abc import Callable, Iterator
+import tempfile
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -18,12 +20,9 @@ from soma_core.view.stage import Body, open_stage
 
 __all__ = ["write_video"]
 
-_ENCODERS = {
-    ".mp4": ["-c:v", "libx264", "-pix_fmt", "yuv420p", "-crf", "18", "-movflags", "+faststart", "-f", "mp4"],
-    ".gif": ["-filter_complex", "split[a][b];[a]palettegen=stats_mode=single[p];"
-             "[b][p]paletteuse=new=1:dither=none", "-loop", "0", "-f", "gif"],
-}  # fmt: skip
-"""What ffmpeg is told after its input, by suffix. One palette for all frames would keep all in memory."""
+_MP4 = ["-c:v", "libx264", "-pix_fmt", "yuv420p", "-crf", "18", "-movflags", "+faststart", "-f", "mp4"]
+_GIF = ["-filter_complex", "[0:v][1:v]paletteuse=dither=none", "-loop", "0", "-f", "gif"]
+"""What ffmpeg is told after its input."""
 
 _NARROW = 2.5
 """Width of a path that one still camera sees [m]; along a longer one it goes with the body."""
@@ -51,6 +50,7 @@ def write_video(
     Raises:
         SomaError: imageio-ffmpeg or pyvista is not installed, or ffmpeg failed.
     """
+    program = _ffmpeg()  # before anything is drawn
     turning = len(set(frames.tolist())) == 1
     chosen = np.unique(np.linspace(0, len(frames) - 1, _FRAMING).round().astype(int))
     bodies = [body(number) for number in dict.fromkeys(frames[chosen].tolist())]
@@ -69,7 +69,7 @@ def write_video(
                 yield picture.tobytes()
 
     drawn = progress(pictures(), label="drawing", total=len(frames), lines=10)
-    atomic_write(path, lambda target: _encode(target, drawn, path.suffix, size=size, fps=fps))
+    atomic_write(path, lambda target: _encode(program, target, drawn, path.suffix, size=size, fps=fps))
 
 
 def _turned(body: Body, share: float) -> Body:
@@ -88,8 +88,12 @@ def _camera_path(places: np.ndarray, fps: float) -> np.ndarray:
     return scipy.ndimage.gaussian_filter1d(places, _SMOOTH * fps, axis=0, mode="nearest")
 
 
-def _encode(path: Path, pictures: Iterator[bytes], suffix: str, *, size: int, fps: float) -> None:
-    """Have ffmpeg write pictures (size, size, 3) of bytes."""
+def _ffmpeg() -> str:
+    """Where the program is.
+
+    Raises:
+        SomaError: imageio-ffmpeg is not installed.
+    """
     try:
         import imageio_ffmpeg
     except ImportError as error:
@@ -97,10 +101,44 @@ def _encode(path: Path, pictures: Iterator[bytes], suffix: str, *, size: int, fp
             "videos need imageio-ffmpeg, which is not installed. Run: pip install 'soma-body-core[video]' "
             "(or leave mp4 and gif out of write=[...])."
         ) from error
+    return str(imageio_ffmpeg.get_ffmpeg_exe())
+
+
+def _encode(
+    program: str, path: Path, pictures: Iterator[bytes], suffix: str, *, size: int, fps: float
+) -> None:
+    """Have ffmpeg write pictures (size, size, 3) of bytes."""
     command = [
-        imageio_ffmpeg.get_ffmpeg_exe(), "-y", "-loglevel", "error", "-f", "rawvideo", "-pix_fmt", "rgb24",
-        "-s", f"{size}x{size}", "-r", f"{fps:g}", "-i", "-", *_ENCODERS[suffix], str(path),
+        program, "-y", "-loglevel", "error", "-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{size}x{size}",
+        "-r", f"{fps:g}", "-i", "-",
     ]  # fmt: skip
+    with tempfile.TemporaryDirectory() as folder:
+        if suffix == ".gif":
+            # The first picture has the colours of all: those of one body and of its shadow.
+            first = next(pictures)
+            palette = _write_palette(Path(folder) / "palette.png", first, size)
+            command += ["-i", str(palette), *_GIF]
+            pictures = itertools.chain([first], pictures)
+        else:
+            command += _MP4
+        _run([*command, str(path)], pictures, path.name)
+
+
+def _write_palette(path: Path, picture: bytes, size: int) -> Path:
+    from PIL import Image
+
+    few = Image.frombytes("RGB", (size, size), picture).quantize(256, dither=Image.Dither.NONE)
+    colours = np.resize(np.array(few.getpalette(), np.uint8).reshape(-1, 3), (256, 3))
+    Image.fromarray(colours.reshape(16, 16, 3)).save(path)
+    return path
+
+
+def _run(command: Sequence[str], pictures: Iterator[bytes], name: str) -> None:
+    """Feed a program.
+
+    Raises:
+        SomaError: it failed, with what it said.
+    """
     with subprocess.Popen(command, stdin=subprocess.PIPE, stderr=subprocess.PIPE) as encoder:  # noqa: S603
         assert encoder.stdin is not None
         assert encoder.stderr is not None
@@ -115,4 +153,4 @@ def _encode(path: Path, pictures: Iterator[bytes], suffix: str, *, size: int, fp
             raise
         told = encoder.stderr.read().decode(errors="replace").strip()
     if encoder.returncode:
-        raise SomaError(f"ffmpeg could not write {path.name}: {told or 'it says nothing'}")
+        raise SomaError(f"ffmpeg could not write {name}: {told or 'it says nothing'}")
