@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import io
 import logging
 import socket
@@ -41,34 +42,39 @@ def open_server(host: str, port: int) -> Any:
 
 
 def _free_port(host: str, port: int) -> int:
+    """The first port from `port` on that nobody has.
+
+    Raises:
+        InputError: no such address, a port that may not be used, or none that is free.
+    """
+    if not 0 <= port < 65536:
+        raise InputError("port", got=port, expected="a number from 0 to 65535", fix="Pass port=8080.")
     for number in range(port, min(port + _NEXT_PORTS, 65536)) if port else (0,):
         try:
-            place = socket.getaddrinfo(host, number, type=socket.SOCK_STREAM)[0]
-            with socket.socket(place[0], place[1]) as one:
-                one.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-                one.bind(place[4])
-                return int(one.getsockname()[1])
+            return _bound(host, number)
         except PermissionError as error:
             raise InputError(
-                "port", got=port, expected="one that may be used", fix="Pass port=8080."
+                "port", got=number, expected="one that you may use", fix="Pass port=8080."
             ) from error
-        except (socket.gaierror, OSError) as error:
-            if isinstance(error, socket.gaierror) or error.errno in (98, 48, 10048):
-                if isinstance(error, socket.gaierror):
-                    raise _no_host(host) from error
-                continue
-            raise _no_host(host) from error
+        except (OSError, UnicodeError) as error:
+            if getattr(error, "errno", None) != errno.EADDRINUSE:
+                raise InputError(
+                    "host", got=host, expected="an address of this machine",
+                    fix="Leave it out for this machine alone, or pass host=0.0.0.0 for all of its addresses.",
+                ) from error  # fmt: skip
     raise InputError(
         "port", got=f"{port} and the next {_NEXT_PORTS - 1}, all taken", expected="a free one",
         fix="Pass port=9000, or port=0 for any.",
     )  # fmt: skip
 
 
-def _no_host(host: str) -> InputError:
-    return InputError(
-        "host", got=host, expected="an address of this machine",
-        fix="Leave it out for this machine alone, or pass host=0.0.0.0 for all of its addresses.",
-    )  # fmt: skip
+def _bound(host: str, port: int) -> int:
+    """A port that can be listened on, by trying to."""
+    family, kind, _, _, place = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
+    with socket.socket(family, kind) as one:
+        one.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        one.bind(place)
+        return int(one.getsockname()[1])
 
 
 def close(server: Any) -> None:
