@@ -23,10 +23,28 @@ def axis_rotation(axis: int, angle: np.ndarray) -> np.ndarray:
 
 def matrices_from_euler(angles: np.ndarray, order: str) -> np.ndarray:
     """Product of rotations about the axes of `order`, the first leftmost; [rad] (..., n) -> (..., 3, 3)."""
+    if len({*order}) == 3:
+        return _three_axes(angles, order)
     matrix = np.broadcast_to(np.eye(3), (*angles.shape[:-1], 3, 3))
     for place, letter in enumerate(order):
         turn = axis_rotation("XYZ".index(letter), angles[..., place])
         matrix = turn if place == 0 else matrix @ turn
+    return matrix
+
+
+def _three_axes(angles: np.ndarray, order: str) -> np.ndarray:
+    """The product written out; in an odd order of axes angles count the other way."""
+    i, j, k = ("XYZ".index(letter) for letter in order)
+    sine, cosine = np.sin(np.moveaxis(angles, -1, 0)), np.cos(np.moveaxis(angles, -1, 0))
+    (sa, sb, sc), (ca, cb, cc) = sine if (j - i) % 3 == 1 else -sine, cosine
+    matrix = np.empty((*angles.shape[:-1], 3, 3))
+    matrix[..., i, i], matrix[..., i, j], matrix[..., i, k] = cb * cc, -cb * sc, sb
+    matrix[..., j, i], matrix[..., j, j], matrix[..., j, k] = (
+        ca * sc + sa * sb * cc, ca * cc - sa * sb * sc, -sa * cb,
+    )  # fmt: skip
+    matrix[..., k, i], matrix[..., k, j], matrix[..., k, k] = (
+        sa * sc - ca * sb * cc, sa * cc + ca * sb * sc, ca * cb,
+    )  # fmt: skip
     return matrix
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 import mmap
 import re
-import warnings
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -16,13 +15,17 @@ from soma_core.errors import AssetError, InputError
 from soma_core.files import refuse_unreadable
 from soma_core.geometry.euler import matrices_from_euler
 from soma_core.io.skeleton_motion import SkeletonMotion
+from soma_core.io.text_numbers import numbers_of_text
 
 __all__ = ["read_bvh"]
 
 _log = logging.getLogger(__name__)
 
 _MOST_JOINTS = 4096
-_CHUNK = 1 << 23
+_CHUNK = 1 << 18
+"""Bytes of text that are taken at once: what is made of them stays in the processor's cache."""
+
+_ROWS = 128
 _WORD = re.compile(
     rb"(?i:(ROOT|JOINT)[ \t]+([^\r\n{}]+))|(?i:(End)[ \t]*Site[^\r\n{}]*)"
     rb"|(?i:(OFFSET|CHANNELS)\b([^\r\n{}]*))|(?i:^[ \t]*(MOTION)\b)|([{}])|(?:\#|//)[^\r\n]*|(\S+)",
@@ -249,14 +252,10 @@ def _parsed(path: Path, piece: bytes) -> np.ndarray:
     if not piece.strip():
         return np.empty(0)
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter(
-                "error"
-            )  # numpy 2.4 warns where a text is none, and returns what came before
-            values = np.fromstring(piece.decode("ascii"), sep=" ")
+        values = numbers_of_text(piece)
         if np.isfinite(values).all():
             return values
-    except (ValueError, DeprecationWarning):
+    except ValueError:
         pass
     wrong = next((word for word in piece.split() if not _is_number(word)), b"?")
     raise InputError(
@@ -289,15 +288,15 @@ def _motion(path: Path, tree: _Tree, rows: np.ndarray, fps: float, root: str | N
     rest = offsets.copy()
     for joint in range(1, len(kept)):
         rest[joint] += rest[parents[joint]]
-    rotations = np.empty((len(rows), len(kept), 3, 3))
+    orders: dict[str, list[tuple[int, list[int]]]] = {}
     moves: dict[int, np.ndarray] = {}
     for index, joint in enumerate(kept):
-        values = rows[:, columns[joint] : columns[joint + 1]]
-        turns = [(place, axis) for place, (axis, rotates) in enumerate(tree.channels[joint]) if rotates]
+        channels = list(enumerate(tree.channels[joint], start=columns[joint]))
+        turns = [(place, axis) for place, (axis, rotates) in channels if rotates]
         order = "".join("XYZ"[axis] for _, axis in turns)
-        rotations[:, index] = matrices_from_euler(np.radians(values[:, [place for place, _ in turns]]), order)
-        moved = [(place, axis) for place, (axis, rotates) in enumerate(tree.channels[joint]) if not rotates]
-        places = values[:, [place for place, _ in moved]]
+        orders.setdefault(order, []).append((index, [place for place, _ in turns]))
+        moved = [(place, axis) for place, (axis, rotates) in channels if not rotates]
+        places = rows[:, [place for place, _ in moved]]
         if moved and (index == 0 or np.any(places)):
             bone = np.tile(offsets[index], (len(rows), 1))
             bone[:, [axis for _, axis in moved]] = places
@@ -307,13 +306,25 @@ def _motion(path: Path, tree: _Tree, rows: np.ndarray, fps: float, root: str | N
         names=tuple(tree.names[joint] for joint in kept),
         parents=parents,
         rest=rest,
-        rotations=rotations,
+        rotations=_turns(rows, len(kept), orders),
         root=place,
         fps=fps,
         ends=np.array([tree.ends[joint] for joint in kept]),
         moves=_that_move(moves, offsets),
         source=path.name,
     )
+
+
+def _turns(rows: np.ndarray, count: int, orders: dict[str, list[tuple[int, list[int]]]]) -> np.ndarray:
+    """Rotations (frames, joints, 3, 3), for joints of one order of channels at once."""
+    rotations = np.empty((len(rows), count, 3, 3))
+    for start in range(0, len(rows), _ROWS):
+        block = rows[start : start + _ROWS]
+        for order, joints in orders.items():
+            angles = np.radians(block[:, [columns for _, columns in joints]])
+            turned = slice(None) if len(joints) == count else [joint for joint, _ in joints]
+            rotations[start : start + _ROWS, turned] = matrices_from_euler(angles, order)
+    return rotations
 
 
 def _that_move(moves: dict[int, np.ndarray], offsets: np.ndarray) -> dict[int, np.ndarray]:
