@@ -1,7 +1,7 @@
 """Time the reading of BVH files: ``python benchmarks/bvh.py [--frames N]``, one thread.
 
-What is read is compared with what was written first. Frames a second are medians of processor time; the ratio is
-against the parser of numpy on the same numbers in the same process, since machines are busy.
+What is read is compared with what was written first. Frames a second are medians of processor time; the ratio
+is against the parser of numpy on the same numbers in the same process, since machines are busy.
 """
 
 from __future__ import annotations
@@ -24,8 +24,8 @@ from soma_core.io.skeleton_motion import SkeletonMotion
 from tests.skeletons import biped, moved
 
 _PARTS = (
-    "hips:Hips spine:a,b,c neck:Neck head:Head collar:*Shoulder arm:*Arm elbow:*ForeArm wrist:*Hand thigh:*UpLeg "
-    "knee:*Leg ankle:*Foot toe:*Toe"
+    "hips:Hips spine:a,b,c neck:Neck head:Head collar:*Shoulder arm:*Arm elbow:*ForeArm wrist:*Hand "
+    "thigh:*UpLeg knee:*Leg ankle:*Foot toe:*Toe"
 )
 _NEAR_MM = 1e-3
 
@@ -77,8 +77,8 @@ def main() -> None:
             taken = _seconds(lambda file=path: read_bvh(file))
             plain = _seconds(lambda text=numbers: np.fromstring(text, sep=" "))
             sys.stdout.write(
-                f"{name}: {found.frame_count / taken:,.0f} frames/s, {taken / plain:.2f} of the time that numpy "
-                f"takes for the numbers alone ({apart:.1e} mm from what was written)\n"
+                f"{name}: {found.frame_count / taken:,.0f} frames/s, {taken / plain:.2f} of the time that "
+                f"numpy takes for the numbers alone ({apart:.1e} mm from what was written)\n"
             )
 
 

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import json
+import struct
 from collections.abc import Mapping
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from soma_core.io.skeleton_motion import SkeletonMotion
 
-__all__ = ["along_axes", "biped", "in_another_pose", "moved"]
+__all__ = ["along_axes", "biped", "glb_bytes", "in_another_pose", "moved", "write_vrm"]
 
 FPS = 60.0
 
@@ -119,3 +122,57 @@ def along_axes(motion: SkeletonMotion) -> SkeletonMotion:
         side /= np.linalg.norm(side)
         turns.append(np.stack([bone, np.cross(side, bone), side]))
     return replace(in_another_pose(motion, np.stack(turns)))
+
+
+def write_vrm(motion: SkeletonMotion, path: Path, bones: Mapping[str, str], *, version: int = 1) -> None:
+    """Write a motion as VRM, whose joints have no names: `bones` tells which bone of a human each one is.
+
+    The skin is bound in the rest pose; the nodes themselves stand in another one.
+    """
+    count, frames = len(motion.names), motion.frame_count
+    offsets = motion.rest - np.where(motion.parents[:, None] < 0, 0, motion.rest[motion.parents])
+    inverse = np.tile(np.eye(4), (count, 1, 1))
+    inverse[:, 3, :3] = -motion.rest  # columns first
+    turns = Rotation.from_matrix(motion.rotations.reshape(-1, 3, 3)).as_quat().reshape(frames, count, 4)
+    arrays = [(np.arange(frames) / motion.fps, "SCALAR"), (motion.root, "VEC3"), (inverse, "MAT4")]
+    arrays += [(turns[:, joint], "VEC4") for joint in range(count)]
+    data, views, accessors = b"", [], []
+    for values, kind in arrays:
+        part = np.ascontiguousarray(values, np.float32)
+        views.append({"buffer": 0, "byteOffset": len(data), "byteLength": part.nbytes})
+        accessors.append(
+            {"bufferView": len(views) - 1, "componentType": 5126, "count": len(part), "type": kind}
+        )
+        data += part.tobytes()
+    samplers = [{"input": 0, "output": output} for output in (1, *range(3, 3 + count))]
+    channels = [{"sampler": 0, "target": {"node": 0, "path": "translation"}}]
+    channels += [
+        {"sampler": joint + 1, "target": {"node": joint, "path": "rotation"}} for joint in range(count)
+    ]
+    nodes = [
+        {"name": f"node{joint}", "translation": offsets[joint].tolist(), "rotation": [0, 0, 0.6, 0.8],
+         "children": np.flatnonzero(motion.parents == joint).tolist()}
+        for joint in range(count)
+    ]  # fmt: skip
+    placed = {bones[name]: joint for joint, name in enumerate(motion.names) if name in bones}
+    human = {
+        "VRMC_vrm": {"humanoid": {"humanBones": {name: {"node": node} for name, node in placed.items()}}}
+    }
+    if version == 0:
+        human = {
+            "VRM": {"humanoid": {"humanBones": [{"bone": n, "node": node} for n, node in placed.items()]}}
+        }
+    document = {
+        "asset": {"version": "2.0"}, "nodes": nodes, "accessors": accessors, "bufferViews": views,
+        "skins": [{"joints": list(range(count)), "inverseBindMatrices": 2}], "extensions": human,
+        "animations": [{"channels": channels, "samplers": samplers}], "buffers": [{"byteLength": len(data)}],
+    }  # fmt: skip
+    path.write_bytes(glb_bytes(document, data))
+
+
+def glb_bytes(document: object, data: bytes = b"") -> bytes:
+    """A GLB of a JSON document and a binary chunk."""
+    text = (document if isinstance(document, str) else json.dumps(document)).encode()
+    text += b" " * (-len(text) % 4)
+    chunks = struct.pack("<I4s", len(text), b"JSON") + text + struct.pack("<I4s", len(data), b"BIN\0") + data
+    return struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks

@@ -16,7 +16,8 @@ from soma_core.evaluation.report import Figure, Report, Table
 from soma_core.io.joint_order import CONTACT_JOINTS, USER_JOINTS, nearest_ancestors
 from soma_core.io.motion import Motion
 from soma_core.layer import SomaLayer
-from soma_core.motion.animated import animate, load_clip
+from soma_core.motion.animated import animate
+from soma_core.motion.conversion import load_clip
 from soma_core.motion.ground import leg_length, rest_offsets
 from soma_core.skeleton.identity import Identity
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import json
+import math
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Literal
@@ -22,10 +23,29 @@ from soma_core.io.npz_fields import check_rotations, open_npz
 from soma_core.io.npz_parts import write_npz_parts
 from soma_core.io.soma_npz import SCHEMA_VERSION, read_soma_npz
 
-__all__ = ["check_rig", "read_motion", "write_motion", "write_motion_parts"]
+__all__ = ["check_rig", "read_motion", "samples_of", "write_motion", "write_motion_parts"]
 
 _LONG = {"poses": "rotations", "transl": "translation", "foot_contacts": "contacts"}
 """Keys of a file that hold an entry a frame, and the field of a motion that they come from."""
+
+
+def samples_of(path: str | Path) -> int:
+    """How many motions a file on this skeleton holds: samples of kimodo, people of GEM-X; else 1.
+
+    Raises:
+        AssetError: the file is missing, damaged, a git-LFS pointer or no NPZ.
+    """
+    if Path(path).suffix.lower() in DATA_SUFFIXES[1:]:
+        with open_data(path) as file:
+            parts = gem_x_result(file)
+    else:
+        with open_npz(path) as fields:
+            for key in ("local_rot_mats", "global_rot_mats"):
+                if key in fields:
+                    shape = fields.raw(key).shape
+                    return shape[0] if len(shape) > 4 else 1
+            parts = gem_x_parts(fields)
+    return 1 if parts is None else math.prod(parts["transl"].shape[:-2])
 
 
 def read_motion(

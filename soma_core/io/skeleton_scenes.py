@@ -69,7 +69,7 @@ def _glb(path: Path, fps: float | None, root: str | None) -> SkeletonMotion:
     worlds = np.concatenate(list(_glb_worlds(tracks, times, order, len(nodes))))
     rest = _node_rest(nodes, parents)
     if not {"LeftForeArm", "LeftShin"} <= {*names} & {*USER_JOINTS}:
-        rest = _bound(file, skins, rest)
+        rest = _bound(file, skins, rest, parents)
     return skeleton_of_worlds(
         [names[joint] for joint in order],
         among(order, parents),
@@ -184,16 +184,35 @@ def _node_rest(nodes: Sequence[dict[str, Any]], parents: np.ndarray) -> np.ndarr
     return worlds
 
 
-def _bound(file: GlbFile, skins: Sequence[dict[str, Any]], rest: np.ndarray) -> np.ndarray:
+def _bound(
+    file: GlbFile, skins: Sequence[dict[str, Any]], rest: np.ndarray, parents: np.ndarray
+) -> np.ndarray:
     """Rest transforms where skins were bound; others keep those of the nodes."""
     bound = rest.copy()
     for skin in skins:
         if "inverseBindMatrices" not in skin:
             continue
         inverse, joints = file.accessor(skin["inverseBindMatrices"]).astype(np.float64), list(skin["joints"])
-        # The space that a skin is bound in is told by its first joint, which stands highest.
-        bound[joints] = rest[joints[0]] @ inverse[0] @ np.linalg.inv(inverse)
+        bound[joints] = _space(rest, parents, joints, np.linalg.inv(inverse)) @ np.linalg.inv(inverse)
     return bound
+
+
+def _space(rest: np.ndarray, parents: np.ndarray, joints: Sequence[int], bound: np.ndarray) -> np.ndarray:
+    """The space that a skin is bound in, which a file does not tell: the scene's, or that above the joints.
+
+    Nodes may stand in a frame of the animation, so that of the two the one is taken in which bones are as
+    long as theirs and lie nearer to them; where neither is, that in which the first joint stands as bound.
+    """
+    above = int(parents[joints[0]])
+    places, spaces = rest[joints, :3, 3], [np.eye(4), *([rest[above]] if above >= 0 else [])]
+    size = np.linalg.norm(places - places[0], axis=1).max()
+    found = []
+    for space in spaces:
+        moved = (space @ bound)[:, :3, 3]
+        longest = np.linalg.norm(moved - moved[0], axis=1).max()
+        if 0.5 * size < longest < 2 * size:
+            found.append((float(np.linalg.norm(moved - places, axis=1).mean()), space))
+    return min(found, key=lambda each: each[0])[1] if found else rest[joints[0]] @ np.linalg.inv(bound[0])
 
 
 def read_usd_skeleton(path: Path, *, fps: float | None = None, root: str | None = None) -> SkeletonMotion:

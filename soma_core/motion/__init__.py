@@ -10,13 +10,14 @@ from typing import TYPE_CHECKING
 from soma_core._lazy import lazy_names
 
 if TYPE_CHECKING:
-    from soma_core.motion.animated import Animated, animate, load_clip
+    from soma_core.motion.animated import Animated, animate
     from soma_core.motion.conversion import (
         FolderConverted,
         convert,
         convert_file,
         convert_folder,
         convert_people,
+        load_clip,
     )
     from soma_core.motion.converter import Converted, finish_fit, invert, plan_fit
     from soma_core.motion.files import layout_of, read, write
@@ -62,13 +63,14 @@ __all__ = [
 ]
 
 _HOMES = {
-    "soma_core.motion.animated": ["Animated", "animate", "load_clip"],
+    "soma_core.motion.animated": ["Animated", "animate"],
     "soma_core.motion.conversion": [
         "FolderConverted",
         "convert",
         "convert_file",
         "convert_folder",
         "convert_people",
+        "load_clip",
     ],
     "soma_core.motion.converter": ["Converted", "finish_fit", "invert", "plan_fit"],
     "soma_core.motion.files": ["layout_of", "read", "write"],

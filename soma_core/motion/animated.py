@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -15,7 +14,6 @@ from soma_core.errors import InputError
 from soma_core.io.motion import Motion
 from soma_core.io.motion_files import check_rig
 from soma_core.layer import SomaLayer
-from soma_core.motion.files import read
 from soma_core.motion.foot_lock import lock_feet
 from soma_core.motion.ground import (
     FootTrack,
@@ -28,18 +26,14 @@ from soma_core.motion.ground import (
     standing,
 )
 from soma_core.motion.identities import kept_identity
-from soma_core.motion.poses import POSES, named_pose
-from soma_core.motion.questions import Names, of_motion, say
-from soma_core.options import Contacts, FrameRange, Ground, LengthUnit, Translation
-from soma_core.paths import expanded
+from soma_core.options import Contacts, Ground, Translation
 from soma_core.progress import progress
-from soma_core.rig.manifest import shipped_file
 
 if TYPE_CHECKING:
     from soma_core.animation.posed import Posed
     from soma_core.skeleton.identity import Identity
 
-__all__ = ["Animated", "animate", "load_clip"]
+__all__ = ["Animated", "animate"]
 
 _log = logging.getLogger(__name__)
 
@@ -66,46 +60,6 @@ class Animated:
     vertices: Mapping[int, np.ndarray]
     feet: FootTrack | None = None
     contacts: np.ndarray | None = None
-
-
-def load_clip(
-    path: str | Path | None = None,
-    *,
-    fps: float | None = None,
-    person: str | None = None,
-    unit: LengthUnit | str | None = None,
-    frames: FrameRange | None = None,
-) -> Motion:
-    """Some frames of a motion file.
-
-    Args:
-        path: a motion on this skeleton, or the name of a pose as ``T-pose``, see ``soma_core.motion.poses``;
-            None for the clip that ships with the project.
-        fps: frame rate, where the file has none.
-        person: which sample of a file of several, ``0`` for the first.
-        unit: ``m``, ``cm`` or ``mm``, where the file does not say or is wrong.
-        frames: which; None for all.
-
-    Raises:
-        SomaError: the file cannot be read.
-        InputError: no frame is left.
-    """
-    frames = frames or FrameRange()
-    if str(path) in POSES:
-        motion = named_pose(str(path))
-    else:
-        path = expanded(path) if path else shipped_file("motions/range_of_motion.npz")
-        motion = read(path, fps=fps, unit=unit, person=person)
-        say(path.name, of_motion(motion, Names(unit="motion_unit", fps="motion_fps", ups=())))
-    part = slice(frames.start, frames.stop, frames.step)
-    if part.step < 1 or not len(range(motion.frame_count)[part]):
-        raise InputError(
-            "frames",
-            got=f"start={part.start}, stop={part.stop}, step={part.step}",
-            expected=f"a step of at least 1 and a range inside the {motion.frame_count} frames",
-            fix="Give frames.start, frames.stop and frames.step inside the motion.",
-        )
-    return replace(motion.cut(part), fps=motion.fps / part.step)
 
 
 def animate(

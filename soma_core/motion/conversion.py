@@ -9,23 +9,27 @@ import shutil
 import tempfile
 import traceback
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
 from soma_core.cache import atomic_text
 from soma_core.errors import InputError, SomaError
 from soma_core.io.motion import Motion
+from soma_core.io.motion_files import samples_of
 from soma_core.io.smpl_files import people_of
 from soma_core.motion.back import BackConverter
 from soma_core.motion.bodies import SMPL_LAYOUTS
 from soma_core.motion.converter import Converted, Converter
-from soma_core.motion.files import SUFFIXES, ResultFiles, layout_of, no_motion
+from soma_core.motion.files import SUFFIXES, ResultFiles, layout_of, no_motion, read
 from soma_core.motion.options import ConvertOptions
-from soma_core.options import Picture
+from soma_core.motion.poses import POSES, named_pose
+from soma_core.motion.questions import Names, of_motion, say
+from soma_core.options import FitLod, FrameRange, LengthUnit, ModelOptions, Picture
 from soma_core.paths import expanded
+from soma_core.rig.manifest import shipped_file
 
-__all__ = ["FolderConverted", "convert", "convert_file", "convert_folder", "convert_people"]
+__all__ = ["FolderConverted", "convert", "convert_file", "convert_folder", "convert_people", "load_clip"]
 
 EVERYONE = "all"
 """Value of the option ``person`` that means each of them."""
@@ -51,6 +55,81 @@ def convert(source: str | Path, *, options: ConvertOptions | None = None) -> Mot
         return convert_file(source, folder, options=replace(options, picture=Picture(frames=0))).motion()
 
 
+def load_clip(
+    path: str | Path | None = None,
+    *,
+    fps: float | None = None,
+    person: str | None = None,
+    unit: LengthUnit | str | None = None,
+    frames: FrameRange | None = None,
+    model: ModelOptions | None = None,
+) -> Motion:
+    """Some frames of a motion file, whatever tool wrote it.
+
+    A motion of another skeleton or body is converted, as :func:`convert` does with the options left out.
+
+    Args:
+        path: the file, or the name of a pose as ``T-pose``, see ``soma_core.motion.poses``; None for the clip
+            that ships with the project.
+        fps: frame rate, where the file has none.
+        person: which person, or sample of a file of several, ``0`` for the first.
+        unit: ``m``, ``cm`` or ``mm``, where the file does not say or is wrong.
+        frames: which; None for all.
+        model: that poses are fitted with, where a body has to be fitted.
+
+    Raises:
+        SomaError: the file cannot be read.
+        InputError: no frame is left.
+    """
+    motion, frames = _clip(path, fps, person, unit, model or ModelOptions()), frames or FrameRange()
+    part = slice(frames.start, frames.stop, frames.step)
+    if part.step < 1 or not len(range(motion.frame_count)[part]):
+        raise InputError(
+            "frames",
+            got=f"start={part.start}, stop={part.stop}, step={part.step}",
+            expected=f"a step of at least 1 and a range inside the {motion.frame_count} frames",
+            fix="Give frames.start, frames.stop and frames.step inside the motion.",
+        )
+    return replace(motion.cut(part), fps=motion.fps / part.step)
+
+
+def _clip(
+    path: str | Path | None, fps: float | None, person: str | None, unit: str | None, model: ModelOptions
+) -> Motion:
+    """All frames of a pose or a file."""
+    if str(path) in POSES:
+        return named_pose(str(path))
+    path = expanded(path) if path else shipped_file("motions/range_of_motion.npz")
+    if layout_of(path) not in (None, "soma", "kimodo"):
+        return _converted(path, fps, person, unit, model)
+    motion = read(path, fps=fps, unit=unit, person=person)
+    say(path.name, of_motion(motion, Names(unit="motion_unit", fps="motion_fps", ups=())))
+    return motion
+
+
+def _converted(
+    path: Path, fps: float | None, person: str | None, unit: str | None, model: ModelOptions
+) -> Motion:
+    """A motion of another skeleton or body, brought to this one.
+
+    Raises:
+        SomaError: it cannot be, or needs settings that a conversion alone has.
+    """
+    lod = FitLod.mid if model.lod == "mid" else FitLod.low
+    chosen = {each.name: getattr(model, each.name) for each in fields(ModelOptions)}
+    options = ConvertOptions(
+        **{**chosen, "lod": lod}, fps=fps, person=person, unit=None if unit is None else LengthUnit(unit)
+    )
+    try:
+        return convert(path, options=options)
+    except SomaError:
+        _log.warning(
+            "%s: soma convert takes all settings of such a file, and soma animate its motion.npz; here fps= "
+            "and unit= are motion_fps= and motion_unit=", path.name,
+        )  # fmt: skip
+        raise
+
+
 def convert_file(source: str | Path, out: str | Path, *, options: ConvertOptions | None = None) -> Converted:
     """Convert a file; write the motion, the errors and a report.
 
@@ -74,10 +153,10 @@ def convert_file(source: str | Path, out: str | Path, *, options: ConvertOptions
 def convert_people(
     source: str | Path, out: str | Path, *, options: ConvertOptions | None = None
 ) -> dict[str, Converted]:
-    """Convert the motion of every person in a file of the SMPL family, each into a folder of its own.
+    """Convert the motion of every person or sample in a file, each into a folder of its own.
 
     Args:
-        source: the file.
+        source: the file, of the SMPL family, GEM-X or kimodo.
         out: folder of the results, in which each person has one.
         options: of the conversions; ``person`` does not count.
 
@@ -98,11 +177,16 @@ def _people(source: Path) -> dict[str, str]:
     Raises:
         InputError: it holds none of the SMPL family.
     """
-    people = people_of(source) if layout_of(source) in SMPL_LAYOUTS else []
+    layout, people = layout_of(source), []
+    if layout in SMPL_LAYOUTS:
+        people = people_of(source)
+    elif layout in ("kimodo", "soma"):
+        count = samples_of(source)
+        people = [str(number) for number in range(count)] if count > 1 else [""]
     if not people:
         raise InputError(
             f"{source}: person", got="all, of a file without people to choose from",
-            expected="a file of the SMPL family", fix="Leave person out.",
+            expected="one of the SMPL family, of GEM-X or kimodo", fix="Leave person out.",
         )  # fmt: skip
     names = {person: re.sub(r"[^\w.-]+", "_", person).strip(".") or "person" for person in people}
     taken = dict.fromkeys(names.values())
@@ -187,8 +271,10 @@ def _converters(
         people = _people(file) if everyone and isinstance(convert, Converter) else {}
     except SomaError:
         people = {}  # said when the file is converted
-    if len(people) < 2 or not isinstance(convert, Converter):
+    if not people or not isinstance(convert, Converter):
         return [(name, convert)]
+    if len(people) == 1:
+        return [(name, convert.of_person(""))]
     return [(f"{name}/{called}", convert.of_person(person)) for person, called in people.items()]
 
 

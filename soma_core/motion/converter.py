@@ -87,7 +87,7 @@ class Converter:
 
     def of_person(self, person: str) -> Converter:
         """The same for one person of a file of several, with the same backends and fits."""
-        other = Converter(replace(self._options, person=person), refuse_unused=self._refuse_unused)
+        other = Converter(replace(self._options, person=person or None), refuse_unused=self._refuse_unused)
         other._backends = self._backends
         return other
 

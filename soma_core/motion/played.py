@@ -89,7 +89,7 @@ class Played:
             fps=motion.fps, up=self.up, source=motion.source, licence=motion.licence,
         )  # fmt: skip
 
-    def clip(self, metadata: dict[str, str]) -> SkinnedClip:
+    def clip(self, metadata: dict[str, str], *, blend_shapes: bool = True) -> SkinnedClip:
         """The skinned animation, for UsdSkel and glTF; +Y up."""
         layer, parts, helpers = self.layer, [], []
         for frames in self._ranges():
@@ -99,7 +99,8 @@ class Played:
         made = skinned_clip(
             layer.mesh, layer.rig, self.identity, np.concatenate(parts), fps=self.motion.fps,
             helpers=np.concatenate(helpers) if layer.procedural else None,
-            colour=backend_colour(layer.backend), metadata=metadata, shapes=self._shapes(),
+            colour=backend_colour(layer.backend), metadata=metadata,
+            shapes=self._shapes() if blend_shapes else None,
         )  # fmt: skip
         for text in made.limits.values():
             _log.info("skinned files: %s", text)

@@ -90,8 +90,9 @@ class BodyProducts:
         settings = {
             "content": fingerprint(path), **model_settings(layer), "backend": layer.backend,
             "params": stored.get("params"), "options": layer.options, **self._placing,
-            "joints": options.joints, "camera": camera, "write_up": options.write_up,
-            "bvh": asdict(options.bvh), "video": asdict(options.video), "picture": asdict(options.picture),
+            "blend_shapes": options.blend_shapes, "joints": options.joints, "camera": camera,
+            "write_up": options.write_up, "bvh": asdict(options.bvh), "video": asdict(options.video),
+            "picture": asdict(options.picture),
         }  # fmt: skip
         settings = json.loads(json.dumps(settings, default=str))
         places = {product: files.product(product) for product in options.shown}
@@ -158,7 +159,7 @@ def write_body(path: str | Path, layer: SomaLayer, identity: Identity, motion: M
     """
     product = {".glb": Product.glb, ".html": Product.html}.get(Path(path).suffix, Product.usd)
     played = Played(layer=layer, identity=identity, motion=motion)
-    WRITERS[product].write(Path(path), *_NEEDED["body"](played))
+    WRITERS[product].write(Path(path), *_NEEDED["body"](played, played, WriteOptions(), None))
 
 
 def _camera(options: WriteOptions) -> Camera:
@@ -171,7 +172,9 @@ _NEEDED: Mapping[str, Callable[..., tuple[Any, ...]]] = {
     "joints": lambda _, turned, options, __: (turned.joints(options.joints),),
     "view": lambda played, _, options, __: (played.joints(options.joints), _camera(options)),
     "vertices": lambda _, turned, *__: (turned.meshes(),),
-    "body": lambda played, *_: (played.clip(_metadata(played)),),
+    "body": lambda played, _, options, __: (
+        played.clip(_metadata(played), blend_shapes=options.blend_shapes),
+    ),
     "pictures": lambda played, _, __, picture: (played, picture),
     "video": lambda played, _, options, __: (played, options.video),
 }

@@ -42,7 +42,7 @@ class Writer:
         getattr(importlib.import_module(module), name)(path, *what)
 
 
-_IO, _UP = "soma_core.io", ("write_up",)
+_IO, _UP, _SHAPES = "soma_core.io", ("write_up",), ("blend_shapes",)
 
 WRITERS: dict[Product, Writer] = {
     Product.npz: Writer(
@@ -92,14 +92,15 @@ WRITERS: dict[Product, Writer] = {
     ),
     Product.usd: Writer(
         file="body.usdc", needs="body", function=f"{_IO}.usd:write_usd",
-        summary="UsdSkel: mesh, skeleton, skin and animation",
+        summary="UsdSkel: mesh, skeleton, skin and animation", settings=_SHAPES,
     ),
     Product.glb: Writer(
         file="body.glb", needs="body", function=f"{_IO}.gltf:write_gltf", summary="glTF: the same",
+        settings=_SHAPES,
     ),
     Product.html: Writer(
         file="body.html", needs="body", function="soma_core.view.page:write_page",
-        summary="a page that plays the body in a browser, with no server and no network",
+        summary="a page that plays the body in a browser, with no server and no network", settings=_SHAPES,
     ),
     Product.png: Writer(
         file="contact_sheet.png", needs="pictures", function="soma_core.motion.products:draw_contact_sheet",
@@ -133,6 +134,7 @@ class WriteOptions(Options):
     """How some of the products are written.
 
     Attributes:
+        blend_shapes: whether skinned files hold the pose correctives; finding shapes for them takes seconds.
         joints: names of the joints that are written, in this order; None: all.
         camera: JSON file of the camera that sees keypoints; see ``soma_core.io.camera``.
         write_up: upward axis of the world of joints and vertices; None: y.
@@ -140,6 +142,7 @@ class WriteOptions(Options):
         video: of MP4 and GIF.
     """
 
+    blend_shapes: bool = True
     joints: list[str] | None = None
     camera: str | None = None
     write_up: Upward | None = None
@@ -151,6 +154,8 @@ class WriteOptions(Options):
         usual, found = WriteOptions.__dataclass_fields__, {}
         for name in usual:
             value = getattr(self, name)
+            if isinstance(value, bool):
+                value = None if value else "false"
             if isinstance(value, Options):
                 plain = vars(type(value)())
                 changed = {key: str(each) for key, each in vars(value).items() if each != plain[key]}

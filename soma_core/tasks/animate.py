@@ -11,7 +11,8 @@ import torch
 from omegaconf import OmegaConf
 
 from soma_core.errors import InputError
-from soma_core.motion.animated import animate, load_clip
+from soma_core.motion.animated import animate
+from soma_core.motion.conversion import load_clip
 from soma_core.motion.identities import backend_of, stored_identity
 from soma_core.motion.models import open_layer
 from soma_core.motion.played import Played
@@ -47,7 +48,7 @@ def run(config: DictConfig, output: Path) -> None:
     options.refuse_unused(options.write)
     motion = load_clip(
         options.motion, fps=options.motion_fps, unit=options.motion_unit, person=options.person,
-        frames=options.frames,
+        frames=options.frames, model=options,
     )  # fmt: skip
     kept, chosen = options.identity_from == "motion", options.backend
     if kept and chosen.params:

@@ -10,7 +10,8 @@ import numpy as np
 import torch
 
 from soma_core.errors import SomaError
-from soma_core.motion.animated import animate, load_clip
+from soma_core.motion.animated import animate
+from soma_core.motion.conversion import load_clip
 from soma_core.motion.models import open_layer
 from soma_core.plugin.errors import BackendError
 from soma_core.plugin.registry import default_registry
@@ -51,7 +52,7 @@ def draw_gallery(options: AnimateConfig, path: Path) -> None:
     """
     motion = load_clip(
         options.motion, fps=options.motion_fps, unit=options.motion_unit, person=options.person,
-        frames=options.frames,
+        frames=options.frames, model=options,
     )  # fmt: skip
     frame = motion.frame_count // 2 if options.motion else round(_POSE_SECOND * motion.fps)
     frame = min(frame, motion.frame_count - 1)

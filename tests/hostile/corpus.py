@@ -14,7 +14,8 @@ from pathlib import Path
 import numpy as np
 
 from tests.hostile.bombs import instances, made
-from tests.hostile.readers import USD, glb_bytes
+from tests.hostile.readers import USD
+from tests.skeletons import glb_bytes
 from tests.standins.pickles import Instance, ch, csc, write_pickle
 
 __all__ = ["BOMB_BYTES", "FILES", "LINKS", "SENTINEL"]

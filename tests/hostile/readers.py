@@ -33,7 +33,7 @@ from soma_core.tasks.wrap import read_landmarks
 from tests.fbx_files import write_fbx
 from tests.io.smpl_layouts import TURNS as SMPLX_TURNS
 from tests.io.smpl_layouts import save_joblib, save_npy, save_npz, save_pt, smplx_names, wham
-from tests.skeletons import moved
+from tests.skeletons import glb_bytes, moved
 from tests.standins.pickles import ch, csc, select, write_pickle
 
 __all__ = ["READERS", "Reader"]
@@ -167,14 +167,6 @@ def _glb(path: Path) -> None:
 def _joints_glb(path: Path) -> None:
     nodes = [{"name": "Hips", "children": [1]}, {"name": "LeftLeg", "translation": [0, -1, 0]}]
     path.write_bytes(glb_bytes({"asset": {"version": "2.0"}, "nodes": nodes, "skins": [{"joints": [0, 1]}]}))
-
-
-def glb_bytes(document: object, data: bytes = b"") -> bytes:
-    """A GLB of a JSON document and a binary chunk."""
-    text = (document if isinstance(document, str) else json.dumps(document)).encode()
-    text += b" " * (-len(text) % 4)
-    chunks = struct.pack("<I4s", len(text), b"JSON") + text + struct.pack("<I4s", len(data), b"BIN\0") + data
-    return struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks
 
 
 def _pickle(path: Path) -> None:

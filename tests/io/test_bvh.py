@@ -57,14 +57,19 @@ def test_what_is_written_is_read_back(motion, rig, order, joints, rest, tmp_path
     assert turns_apart(second.rotations, found.rotations) < TURN
 
 
-def test_thirty_joints_keep_their_places(motion, rig, tmp_path):
+@pytest.mark.parametrize("order", ORDERS)
+def test_thirty_joints_keep_their_places(motion, rig, order, tmp_path):
     whole = soma_skeleton(motion, rig)
     part = whole.subset(KIMODO_30_JOINTS)
-    write_bvh(part, tmp_path / "a.bvh", order="YZX", unit="m")
+    write_bvh(part, tmp_path / "a.bvh", order=order, unit="m")
     found = read_bvh(tmp_path / "a.bvh")
     kept = [USER_JOINTS.index(name) for name in found.names]
     assert sorted(found.names) == sorted(KIMODO_30_JOINTS)
     assert 1e3 * np.abs(found.positions() - whole.positions()[:, kept]).max() < PLACE_MM
+    assert (
+        turns_apart(found.rotations, part.rotations[:, [part.names.index(each) for each in found.names]])
+        < TURN
+    )
 
 
 @pytest.mark.parametrize("rest", ["t_pose", "bind"])
