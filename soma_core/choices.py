@@ -76,9 +76,13 @@ class Contacts(StrEnum):
 
 
 class BoneMatch(StrEnum):
-    """Which bones of another skeleton are matched by direction; the others keep their turn since rest."""
+    """Which bones of another skeleton are matched by direction; the others keep their turn since rest.
+
+    ``soles`` matches all but the slope of feet.
+    """
 
     bones = "bones"
+    soles = "soles"
     limbs = "limbs"
 
 

@@ -42,7 +42,7 @@ def carried(path: Path, layout: str, options: ConvertOptions) -> Retargeted:
         mapping=mapping,
         unit=str(options.unit) if options.unit else None,
         up=up,
-        match=str(match or BoneMatch.bones),
+        match=str(match or BoneMatch.soles),
     )
     left = found.report["not_carried"]
     if left:

@@ -163,8 +163,9 @@ class ConvertOptions(WriteOptions, FitOptions):
         carry: for models of the SMPL family: ``skeleton`` needs no model file, and reads no betas.
         mapping: file that says which joint of a skeleton is which, where its names are not known.
         root: of a file with several skeletons, the one that is read.
-        match: which bones of another skeleton are matched by direction: ``bones`` all, ``limbs`` those of
-            arms, legs and fingers; None: all, but for the SMPL family the limbs.
+        match: which bones of another skeleton are matched by direction: ``bones`` all, ``soles`` all but the
+            slope of feet, ``limbs`` those of arms, legs and fingers; None: ``soles``, and ``limbs`` for the
+            SMPL family.
     """
 
     to: str = "soma"

@@ -18,6 +18,9 @@ __all__ = ["Alignment", "align", "own_alignment"]
 _BENT = 0.1
 """Mean sine of the bend of a knee or elbow that tells its axis."""
 
+_LOW = 0.5
+"""Share of frames whose toes are lowest, and of these the share that moves least: there a foot stands."""
+
 _CLOSE = np.cos(np.radians(15))
 _SAME_POSE = np.cos(np.radians(5))
 
@@ -92,7 +95,7 @@ def align(
     turns: np.ndarray,
     rest: Mapping[str, np.ndarray],
     *,
-    limbs: bool = False,
+    by: str = "bones",
 ) -> Alignment:
     """Turns of every joint that was found, from the root down: the shortest way for each bone in turn.
 
@@ -103,9 +106,10 @@ def align(
         neck: joints there.
         turns: (frames, J, 3, 3) of the source's joints since its rest pose.
         rest: joint positions of the T-pose here [m].
-        limbs: in a human rest pose, only arms, legs and fingers are matched.
+        by: ``limbs``: in a human rest pose, only arms, legs and fingers are matched; ``soles``: all but the
+            slope of feet.
     """
-    return _Aligner(found, match, turns, rest, limbs=limbs).align(spine, neck)
+    return _Aligner(found, match, turns, rest, by=by).align(spine, neck)
 
 
 class _Aligner:
@@ -118,11 +122,11 @@ class _Aligner:
         turns: np.ndarray,
         rest: Mapping[str, np.ndarray],
         *,
-        limbs: bool,
+        by: str,
     ) -> None:
         self._source, self._standing = found.source, found.standing
         self._match, self._turns, self._rest = match, turns, rest
-        self._limbs = limbs and found.standing
+        self._limbs, self._soles = by == "limbs" and found.standing, by == "soles"
         self._found: dict[str, np.ndarray] = {}
         self._along: dict[int, np.ndarray] = {}
 
@@ -200,6 +204,8 @@ class _Aligner:
         trunk = ("Head", "ToeBase", "Shoulder", "Foot") if self._limbs else ("Head", "ToeBase")
         if name == "Head" and not self._standing:
             return self._head(above, turn)
+        if self._soles and name.endswith("ToeBase"):
+            return turn
         if name.endswith(trunk) and self._standing:
             return self._found["Hips"]
         if bones is None:
@@ -207,7 +213,34 @@ class _Aligner:
         hinge = None if self._standing else self._hinge(name)
         if hinge is not None:
             return _frame(unit_vector(bones[1]), hinge[1]) @ _frame(unit_vector(bones[0]), hinge[0]).T
-        return self._turned(turn, bones[0], bones[1], above, self._match[name], parent_turn=turn)
+        turn = self._turned(turn, bones[0], bones[1], above, self._match[name], parent_turn=turn)
+        return turn @ self._slope(name, bones) if self._soles and name.endswith("Foot") else turn
+
+    def _slope(self, name: str, bones: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
+        """Turn of a foot in T-pose from the slope that a foot has there on the ground to its own.
+
+        Ankles lie at other heights above the sole: the direction from ankle to toes says nothing of the sole.
+        """
+        there = bones[1] if self._standing else self._standing_foot(name)
+        if there is None:
+            return np.eye(3)
+        ahead = unit_vector(bones[0] * [1, 0, 1])
+        sloped = np.hypot(there[0], there[2]) * ahead + [0, there[1], 0]
+        return _shortest(sloped, bones[0]) if np.any(sloped) else np.eye(3)
+
+    def _standing_foot(self, name: str) -> np.ndarray | None:
+        """From ankle to toes where a foot stands: the middle of its frames in which it is low and still."""
+        toe = name.replace("Foot", "ToeBase")
+        if toe not in self._match:
+            return None
+        positions = self._source.positions(self._turns)
+        ankle, ball = positions[:, self._match[name]], positions[:, self._match[toe]]
+        speed = np.linalg.norm(np.gradient(ball, axis=0), axis=1) if len(ball) > 1 else np.zeros(1)
+        low = ball[:, 1] <= np.quantile(ball[:, 1], _LOW)
+        still = low & (speed <= np.quantile(speed[low], _LOW))
+        level = (ankle - ball)[still]
+        heading = np.median(np.hypot(level[:, 0], level[:, 2]))
+        return -np.array([heading, np.median(level[:, 1]), 0.0])
 
     def _head(self, above: int, turn: np.ndarray) -> np.ndarray:
         """The turn by quarters that has people look ahead on average: no bone tells how a head is held."""

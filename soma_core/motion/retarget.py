@@ -42,7 +42,7 @@ def retarget(
     mapping: Mapping[str, str] | None = None,
     unit: str | None = None,
     up: str | None = None,
-    match: Literal["bones", "limbs"] | str = "bones",
+    match: Literal["bones", "soles", "limbs"] | str = "bones",
 ) -> Retargeted:
     """Carry the motion of another skeleton over to this one.
 
@@ -60,14 +60,17 @@ def retarget(
         mapping: name of a joint here -> its name there, where names are not known.
         unit: of the source's lengths, ``m``, ``cm`` or ``mm``; None: told by the length of the legs.
         up: upward axis of the source's world, as ``y`` or ``-z``; None: told by its rest pose.
-        match: ``limbs`` matches the bones of arms, legs and fingers alone: where the source rests in a human
-            pose, spine, neck, shoulders and feet turn as they do there, and keep their own shape.
+        match: ``bones`` matches all; ``soles`` all but the slope of feet, which are as flat as there, since
+            ankles lie at other heights above soles; ``limbs`` the bones of arms, legs and fingers alone:
+            where the source rests in a human pose, spine, neck, shoulders and feet turn as they do there, and
+            keep their own shape.
 
     Raises:
         InputError: names that are not known, or a size that fits no unit.
     """
-    if match not in ("bones", "limbs"):
-        raise InputError("match", got=repr(match), expected="'bones' or 'limbs'", fix="Correct it.")
+    if match not in ("bones", "soles", "limbs"):
+        expected = "'bones', 'soles' or 'limbs'"
+        raise InputError("match", got=repr(match), expected=expected, fix="Correct it.")
     joints = match_joints(source.names, source.parents, mapping=mapping, source=source.source or "names")
     spine, neck = chains(source, joints)
     found = placed(source, joints, unit=unit, up=up)
@@ -76,7 +79,7 @@ def retarget(
     same = all(source.names[joint] == name for name, joint in joints.items())
     own = same and own_alignment(found, joints, spine, neck, rig)
     rest = dict(zip(rig.joint_names, rig.t_pose_world[:, :3, 3], strict=True))
-    alignment = own or align(found, joints, spine, neck, turns, rest, limbs=match == "limbs")
+    alignment = own or align(found, joints, spine, neck, turns, rest, by=match)
     goals = {name: turns[:, joints[name]] @ turn for name, turn in alignment.turns.items() if name in joints}
     for targets, chain in ((_SPINE, spine), (_NECK, neck)):
         along = [turns[:, joint] @ turn for joint, turn in zip(chain, alignment.chain(chain), strict=True)]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import logging
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -21,6 +22,7 @@ from soma_core.motion import ConvertOptions, FrameRange, convert_file, load_clip
 from soma_core.motion.retarget import retarget
 from tests.skeletons import along_axes, biped, in_another_pose, moved
 
+FLAT_DEGREES = 1.0
 SAME_DEGREES = 0.05  # float32 rotations and seven decimals of a file; half a degree is what is asked
 
 LAFAN = {
@@ -147,6 +149,28 @@ def test_bones_point_the_same_way(make, rig):
     apart = bones_apart(source, retarget(source), rig)
     assert len(apart) >= 13
     assert max(apart.values()) < SAME_DEGREES, apart
+
+
+@pytest.mark.parametrize("along", [False, True], ids=["standing", "along axes"])
+@pytest.mark.parametrize("higher", [0.0, 0.03])
+def test_soles_are_as_flat_as_there(along, higher, rig):
+    """Ankles that lie higher above the sole leave it flat; every other bone points as there."""
+    names, parents, rest = biped(MIXAMO)
+    rest[[joint for joint, name in enumerate(names) if name.endswith("ToeBase")], 1] -= higher
+    source = moved(names, parents, rest, frames=60, seed=7)
+    feet = [joint for joint, name in enumerate(names) if name.endswith(("Foot", "ToeBase"))]
+    turns = source.turns()
+    turns[:30, feet] = np.eye(3)  # half of the time they stand, whatever the legs do
+    for joint in feet:
+        source.rotations[:, joint] = np.swapaxes(turns[:, parents[joint]], -1, -2) @ turns[:, joint]
+    root = source.root + [0, 10, 0] * (np.arange(60)[:, None] >= 30)  # then they fly
+    source = replace(source, root=root)
+    found = retarget(along_axes(source) if along else source, match="soles")
+    feet_here = soma_skeleton(found.motion, rig).turns()[:30, USER_JOINTS.index("LeftFoot")]
+    pitch = np.degrees(np.arcsin(feet_here[:, 1, 2]))  # how far a sole points up
+    assert np.abs(pitch).max() < FLAT_DEGREES
+    apart = bones_apart(along_axes(source) if along else source, found, rig)
+    assert max(angle for name, angle in apart.items() if "Toe" not in name) < SAME_DEGREES
 
 
 def test_twist_comes_from_knees_and_elbows_where_bones_rest_along_axes(rig):
