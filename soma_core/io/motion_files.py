@@ -40,10 +40,9 @@ def samples_of(path: str | Path) -> int:
             parts = gem_x_result(file)
     else:
         with open_npz(path) as fields:
-            for key in ("local_rot_mats", "global_rot_mats"):
-                if key in fields:
-                    shape = fields.raw(key).shape
-                    return shape[0] if len(shape) > 4 else 1
+            stored = [fields.raw(key) for key in ("local_rot_mats", "global_rot_mats") if key in fields]
+            if stored:
+                return len(stored[0]) if stored[0].ndim > 4 else 1
             parts = gem_x_parts(fields)
     return 1 if parts is None else math.prod(parts["transl"].shape[:-2])
 

@@ -60,10 +60,8 @@ def retarget(
         mapping: name of a joint here -> its name there, where names are not known.
         unit: of the source's lengths, ``m``, ``cm`` or ``mm``; None: told by the length of the legs.
         up: upward axis of the source's world, as ``y`` or ``-z``; None: told by its rest pose.
-        match: ``bones`` matches all; ``soles`` all but the slope of feet, which are as flat as there, since
-            ankles lie at other heights above soles; ``limbs`` the bones of arms, legs and fingers alone:
-            where the source rests in a human pose, spine, neck, shoulders and feet turn as they do there, and
-            keep their own shape.
+        match: ``bones`` matches all; ``soles`` all but the slope of feet, which are as flat as there; ``limbs``
+            arms, legs and fingers: where the source rests as a human, the trunk keeps its own shape.
 
     Raises:
         InputError: names that are not known, or a size that fits no unit.
