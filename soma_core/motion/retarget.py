@@ -20,6 +20,7 @@ from soma_core.rig import load_canonical
 
 __all__ = ["Retargeted", "retarget"]
 
+_MATCHES = ("bones", "soles", "limbs")
 _SPINE, _NECK = ("Spine1", "Spine2", "Chest"), ("Neck1", "Neck2")
 
 
@@ -60,15 +61,14 @@ def retarget(
         mapping: name of a joint here -> its name there, where names are not known.
         unit: of the source's lengths, ``m``, ``cm`` or ``mm``; None: told by the length of the legs.
         up: upward axis of the source's world, as ``y`` or ``-z``; None: told by its rest pose.
-        match: ``bones`` matches all; ``soles`` all but the slope of feet, which are as flat as there; ``limbs``
-            arms, legs and fingers: where the source rests as a human, the trunk keeps its own shape.
+        match: ``bones``: all of them; ``soles``: all but the slope of feet, which are as flat as there;
+            ``limbs``: arms, legs and fingers, the trunk keeps its own shape where the source rests as a human.
 
     Raises:
         InputError: names that are not known, or a size that fits no unit.
     """
-    if match not in ("bones", "soles", "limbs"):
-        expected = "'bones', 'soles' or 'limbs'"
-        raise InputError("match", got=repr(match), expected=expected, fix="Correct it.")
+    if match not in _MATCHES:
+        raise InputError("match", got=repr(match), expected=" or ".join(_MATCHES), fix="Correct it.")
     joints = match_joints(source.names, source.parents, mapping=mapping, source=source.source or "names")
     spine, neck = chains(source, joints)
     found = placed(source, joints, unit=unit, up=up)
