@@ -62,7 +62,7 @@ def retarget(
         unit: of the source's lengths, ``m``, ``cm`` or ``mm``; None: told by the length of the legs.
         up: upward axis of the source's world, as ``y`` or ``-z``; None: told by its rest pose.
         match: ``bones``: all of them; ``soles``: all but the slope of feet, which are as flat as there;
-            ``limbs``: arms, legs and fingers, the trunk keeps its own shape where the source rests as a human.
+            ``limbs``: arms, legs and fingers; the trunk keeps its shape where the source rests as a human.
 
     Raises:
         InputError: names that are not known, or a size that fits no unit.
