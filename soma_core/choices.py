@@ -26,6 +26,7 @@ __all__ = [
     "LengthUnit",
     "Lod",
     "Product",
+    "Refine",
     "RotationLayout",
     "RotationZero",
     "Skinning",
@@ -84,6 +85,12 @@ class BoneMatch(StrEnum):
     bones = "bones"
     soles = "soles"
     limbs = "limbs"
+
+
+class Refine(StrEnum):
+    """What is fitted after the joints of another skeleton were carried over."""
+
+    joints = "joints"
 
 
 class Carry(StrEnum):

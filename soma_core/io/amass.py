@@ -61,6 +61,8 @@ class SmplMotion:
         about: what the root rotation turns about, before the translation: the pelvis, or the origin of the
             model as EasyMocap has it.
         flat_hands: whether zero is a flat hand; False: the model's mean hand.
+        hand_components: (frames, 2 n) coefficients of the model's own components of both hands, left first,
+            which its fingers turn by as well; None for none.
         source: where it came from.
 
     Raises:
@@ -76,6 +78,7 @@ class SmplMotion:
     up: UpAxis = "+z"
     about: Literal["pelvis", "origin"] = "pelvis"
     flat_hands: bool = True
+    hand_components: np.ndarray | None = None
     source: str = ""
 
     def __post_init__(self) -> None:

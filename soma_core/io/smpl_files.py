@@ -209,15 +209,15 @@ class _Reading:
         whole = np.isfinite(pose.rotations).all(axis=(1, 2)) & np.isfinite(translation).all(axis=1)
         unseen = "trans" if np.isfinite(pose.rotations).all() and "trans" in self._parts else pose.leading
         rows, times = kept_frames(whole, numbers, self._parts.where(unseen))
-        rotations, translation = self._without_gaps(
-            pose.rotations[rows], translation[rows], times, fps, len(whole)
-        )
+        moving = np.concatenate([translation, pose.hands], axis=1)[rows]
+        rotations, moving = self._without_gaps(pose.rotations[rows], moving, times, fps, len(whole))
         flat = choices.flat_hand_mean
         return SmplMotion(
-            model=pose.model, rotations=rotations, translation=translation, betas=self._betas(pose),
+            model=pose.model, rotations=rotations, translation=moving[:, :3], betas=self._betas(pose),
             gender=self._gender(), fps=fps, up=self._up(rotations),
             about=self._tool.about if self._tool else "pelvis",
-            flat_hands=self._parts.flag("flat", default=True) if flat is None else flat,
+            flat_hands=self._parts.flag("flat", default=not pose.hands.size) if flat is None else flat,
+            hand_components=moving[:, 3:],
             source=self._file.path.name,
         )  # fmt: skip
 

@@ -39,11 +39,13 @@ class SmplPose:
         model: whose joints.
         rotations: local axis-angle vectors.
         leading: the part that tells the number of frames.
+        hands: (frames, 2 n) coefficients of the model's hand components, left first; n = 0 without any.
     """
 
     model: SmplName
     rotations: np.ndarray
     leading: str
+    hands: np.ndarray
 
     @property
     def frames(self) -> int:
@@ -68,7 +70,8 @@ def read_pose(parts: BodyParts, *, model: SmplName | None, layout: RotationLayou
     rows = groups[_BODY]
     blocks = [groups.get(name, np.zeros((len(rows), _BLOCKS[name], 3))) for name in _MODELS[told]]
     _say_differences(parts, told, groups)
-    return SmplPose(model=told, rotations=np.concatenate(blocks, axis=1), leading=leading)
+    rotations = np.concatenate(blocks, axis=1)
+    return SmplPose(model=told, rotations=rotations, leading=leading, hands=reader.hands(len(rows)))
 
 
 class _Reader:
@@ -76,6 +79,7 @@ class _Reader:
 
     def __init__(self, parts: BodyParts, layout: RotationLayout | None) -> None:
         self._parts, self._layout, self._frames = parts, layout, 0
+        self._components: dict[int, np.ndarray] = {}
 
     def groups(self) -> tuple[dict[str, np.ndarray], str]:
         """Rotations (frames, joints, 3) of the groups that the file has, and the part that leads."""
@@ -96,13 +100,23 @@ class _Reader:
         count = place.stop - place.start
         values = self._parts.numbers(part)
         if group == _HANDS and self._frames and values.size % (self._frames * count * 3):
-            _log.warning(
-                "%s: %d numbers a frame are no rotations of %d joints, but components of the model's hands: "
-                "the fingers stay straight", self._parts.where(part), values.size // self._frames, count,
+            _log.info(
+                "%s: %d numbers a frame are no rotations of %d joints, but components of the model's hands",
+                self._parts.where(part), values.size // self._frames, count,
             )  # fmt: skip
+            sides, rows = (0, 1) if count == 30 else (place.start // 15,), values.reshape(self._frames, -1)
+            self._components |= dict(zip(sides, np.array_split(rows, len(sides), axis=1), strict=True))
             return
         whole = found.setdefault(group, np.zeros((self._frames, _BLOCKS[group], 3)))
         whole[:, place] = self._part(part, count)
+
+    def hands(self, frames: int) -> np.ndarray:
+        """Coefficients (frames, 2 n) of both hands; a hand that the file lacks has zeros."""
+        width = max((values.shape[1] for values in self._components.values()), default=0)
+        found = np.zeros((frames, 2, width))
+        for side, values in self._components.items():
+            found[:, side, : values.shape[1]] = values
+        return found.reshape(frames, 2 * width)
 
     def _leading(self, part: str, joints: Sequence[int]) -> np.ndarray:
         """Rotations of the part that tells the number of frames."""

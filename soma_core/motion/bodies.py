@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, replace
 from enum import StrEnum
@@ -34,6 +35,8 @@ if TYPE_CHECKING:
     from soma_core.plugin.spec import BackendSpec
 
 __all__ = ["FITTED", "SMPL_LAYOUTS", "SMPL_SETTINGS", "ShownBody", "open_body"]
+
+_log = logging.getLogger(__name__)
 
 SMPL_LAYOUTS = ("amass", "smpl")
 """Layouts whose bodies are of the SMPL family."""
@@ -185,7 +188,10 @@ def _model_pose(
         InputError: the user's model file does not hold its mean hands.
     """
     rotations, translation = motion.rotations, motion.translation
-    if not motion.flat_hands and motion.model != "smpl":
+    fingers, flat = _fingers(path, motion, backend)
+    if fingers is not None:
+        rotations = np.concatenate([rotations[:, :-30], rotations[:, -30:] + fingers], axis=1)
+    if not flat and motion.model != "smpl":
         mean = backend.mean_hands
         if mean is None:
             raise InputError(
@@ -200,6 +206,24 @@ def _model_pose(
         pelvis = backend.rest_joints(params)[0]
         translation = translation + Rotation.from_rotvec(rotations[:, 0]).apply(pelvis) - pelvis
     return {"rotations": rotations, "translation": translation.astype(np.float32)}
+
+
+def _fingers(path: Path, motion: SmplMotion, backend: FitBackend) -> tuple[np.ndarray | None, bool]:
+    """What the fingers (frames, 30, 3) turn by components of the hands, and whether zero is a flat hand."""
+    values = motion.hand_components
+    if values is None or not values.size or motion.model == "smpl":
+        return None, motion.flat_hands
+    directions = backend.hand_components
+    if directions is None or values.shape[1] > 2 * directions.shape[1]:
+        _log.warning(
+            "%s: hands are %d components of the model's own, which your %s file does not hold: the fingers "
+            "stay straight; `soma backends convert %s FILE` keeps them",
+            path.name, values.shape[1] // 2, motion.model, motion.model,
+        )  # fmt: skip
+        return None, True
+    coefficients = values.reshape(len(values), 2, -1)
+    turned = np.einsum("fsn,snk->fsk", coefficients, directions[:, : coefficients.shape[2]])
+    return turned.reshape(len(values), 30, 3).astype(np.float32), motion.flat_hands
 
 
 def _usable_betas(path: Path, motion: SmplMotion, spec: BackendSpec, most: int | None) -> list[float]:

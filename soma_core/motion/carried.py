@@ -2,25 +2,33 @@
 
 from __future__ import annotations
 
+import itertools
 import logging
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
+
 from soma_core.io.joint_names import read_mapping
+from soma_core.io.motion import Motion
 from soma_core.io.skeleton_files import read_skeleton
+from soma_core.io.skeleton_motion import soma_skeleton
 from soma_core.io.smpl_files import read_smpl
 from soma_core.io.smpl_skeleton import smpl_skeleton
 from soma_core.motion.bodies import SMPL_LAYOUTS, smpl_choices
+from soma_core.motion.foot_lock import Limb
 from soma_core.motion.options import ConvertOptions
 from soma_core.motion.retarget import Retargeted, retarget
 from soma_core.options import BoneMatch
 from soma_core.rig import load_canonical
+from soma_core.rig.skeleton import Rig
 
-__all__ = ["carried"]
+__all__ = ["carried", "refined"]
 
 _log = logging.getLogger(__name__)
 
 _SHOWN = 12
+_LIMBS = (("Leg", "Shin", "Foot"), ("Arm", "ForeArm", "Hand"))
 
 
 def carried(path: Path, layout: str, options: ConvertOptions) -> Retargeted:
@@ -33,6 +41,8 @@ def carried(path: Path, layout: str, options: ConvertOptions) -> Retargeted:
     if layout in SMPL_LAYOUTS:
         motion = read_smpl(path, replace(smpl_choices(options), gender="neutral", betas=(0.0,) * 10))
         _log.warning("%s: betas are not read: joints are carried over, no body is fitted", path.name)
+        if motion.hand_components is not None and motion.hand_components.size:
+            _log.warning("%s: hands are components of the model: the fingers stay straight", path.name)
         source, up, match = smpl_skeleton(motion, load_canonical("mid")[1]), None, match or BoneMatch.limbs
     else:
         source = read_skeleton(path, fps=options.fps, root=options.root)
@@ -44,6 +54,7 @@ def carried(path: Path, layout: str, options: ConvertOptions) -> Retargeted:
         up=up,
         match=str(match or BoneMatch.soles),
     )
+    found = refined(found) if options.refine == "joints" else found
     left = found.report["not_carried"]
     if left:
         more = " ..." if len(left) > _SHOWN else ""
@@ -58,3 +69,49 @@ def carried(path: Path, layout: str, options: ConvertOptions) -> Retargeted:
             scale * found.report["legs_metres"],
         )
     return found
+
+
+def refined(found: Retargeted) -> Retargeted:
+    """Bring hands and feet to where they are on the other skeleton, its path scaled, by elbows and knees.
+
+    Hands and feet keep their turn in the world, and elbows and knees the way they bend. What a limb does not
+    reach is left; the report says how far hands and feet are away, before and after.
+    """
+    motion, rig = found.motion, load_canonical("mid")[1]
+    names, places = found.source.names, found.source.positions() * found.report["path_scale"]
+    joints = found.report["joints"]
+    rotations = motion.rotations.astype(np.float64)
+    before: dict[str, float] = {}
+    transforms = _transforms(motion, rig)
+    for side, parts in itertools.product(("Left", "Right"), _LIMBS):
+        limb = [side + part for part in parts]
+        if not set(limb) <= set(joints):
+            continue
+        goal = places[:, names.index(joints[limb[-1]])]
+        before[limb[-1]] = _apart(transforms, rig, limb[-1], goal)
+        moved = Limb(transforms, rig, limb)
+        moved.reach(goal, np.eye(3))
+        moved.store(rotations, absolute=False)
+    motion = replace(motion, rotations=rotations.astype(np.float32))
+    transforms = _transforms(motion, rig)
+    told = {
+        name: [apart, _apart(transforms, rig, name, places[:, names.index(joints[name])])]
+        for name, apart in before.items()
+    }
+    return replace(found, motion=motion, report={**found.report, "refined_mm": told})
+
+
+def _transforms(motion: Motion, rig: Rig) -> np.ndarray:
+    """World transforms (frames, 78, 4, 4) of the rig's own body [m]."""
+    skeleton = soma_skeleton(motion, rig)
+    turns = skeleton.turns()
+    found = np.tile(np.eye(4), (motion.frame_count, rig.joint_count, 1, 1))
+    found[:, 1:, :3, :3] = turns @ rig.t_pose_world[1:, :3, :3]
+    found[:, 1:, :3, 3] = skeleton.positions(turns)
+    return found
+
+
+def _apart(transforms: np.ndarray, rig: Rig, joint: str, goal: np.ndarray) -> float:
+    """Mean distance of a joint from where it should be [mm]."""
+    places = transforms[:, rig.joint_names.index(joint), :3, 3]
+    return round(1e3 * float(np.linalg.norm(places - goal, axis=1).mean()), 2)

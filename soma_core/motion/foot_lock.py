@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -13,7 +14,7 @@ from soma_core.io.motion import Motion
 from soma_core.motion.ground import LOW, SLOW, FootTrack
 from soma_core.rig.skeleton import Rig
 
-__all__ = ["lock_feet"]
+__all__ = ["Limb", "lock_feet"]
 
 _EASE_SECONDS = 0.2
 """How long a foot takes from its own path to a pinned one, and back."""
@@ -61,7 +62,9 @@ def lock_feet(
         for index in range(len(CONTACT_JOINTS))
     ]
     goals = [_foot_goal(track.joints[:, 2 * side :], *pins[2 * side : 2 * side + 2]) for side in (0, 1)]
-    legs = [_Leg(transforms, rig, side) for side in ("Left", "Right")]
+    legs = [
+        Limb(transforms, rig, [side + part for part in ("Leg", "Shin", "Foot")]) for side in ("Left", "Right")
+    ]
     drops = [leg.drop(ankle) for leg, (ankle, _) in zip(legs, goals, strict=True)]
     drop = _smooth_drop(np.maximum(*drops), motion.fps, _DEEPEST * track.height)
     rotations = motion.rotations.astype(np.float64)
@@ -127,13 +130,22 @@ def _foot_goal(
     return (there + ahead) / 2 - half, turn
 
 
-class _Leg:
-    """One leg of a posed body, frame by frame; world rotations and places in float64."""
+class Limb:
+    """One leg or arm of a posed body, frame by frame; world rotations and places in float64.
 
-    def __init__(self, transforms: np.ndarray, rig: Rig, side: str) -> None:
+    Hip, knee and ankle of an arm are its shoulder, elbow and wrist.
+
+    Args:
+        transforms: (frames, J, 4, 4) of the body.
+        rig: the canonical rig.
+        joints: names of the three joints.
+    """
+
+    def __init__(self, transforms: np.ndarray, rig: Rig, joints: Sequence[str]) -> None:
         self.rig = rig
-        names = [side + part for part in ("Leg", "Shin", "Foot")]
-        self.joints = [rig.joint_names.index(name) for name in names]
+        self.joints = [rig.joint_names.index(name) for name in joints]
+        arm = {"LeftArm": [0.0, 1, 0], "RightArm": [0.0, -1, 0]}
+        self.bends_about = np.array(arm.get(joints[0], [-1.0, 0, 0]))  # in the T-pose +x is the body's left
         self.hips = transforms[:, rig.parents[self.joints[0]], :3, :3].astype(np.float64)
         moved = transforms[:, self.joints].astype(np.float64)
         self.turned = [moved[:, index, :3, :3] for index in range(3)]
@@ -185,7 +197,7 @@ class _Leg:
         A knee that is nearly straight tells no axis; there it is the one that the thigh has in the T-pose.
         """
         rest = self.rig.t_pose_world[self.joints[0], :3, :3]
-        across = -(self.turned[0] @ rest.T)[..., 0]  # in the T-pose +x is the body's left
+        across = (self.turned[0] @ rest.T) @ self.bends_about
         across = _unit(across - (across * line).sum(axis=1, keepdims=True) * line)[0]
         plane = np.cross(line, self.knee - self.hip)
         side = np.where((plane * across).sum(axis=1) < 0, -1.0, 1.0)
@@ -193,7 +205,7 @@ class _Leg:
         return _unit(side[:, None] * plane + missing[:, None] * across)[0], side
 
     def store(self, rotations: np.ndarray, *, absolute: bool) -> None:
-        """Write the local rotations of the leg into those of a motion (frames, 77, 3, 3)."""
+        """Write the local rotations of the limb into those of a motion (frames, 77, 3, 3)."""
         parent = self.hips
         for joint, world in zip(self.joints, self.turned, strict=True):
             local = np.swapaxes(parent, -1, -2) @ world

@@ -80,6 +80,12 @@ class FitBackend:
         found: np.ndarray | None = getattr(self._generator, "mean_hands", None)
         return found
 
+    @property
+    def hand_components(self) -> np.ndarray | None:
+        """Directions (2, 45, 45) [rad] of the fingers of both hands, of a model that has them, in rows."""
+        found: np.ndarray | None = getattr(self._generator, "hand_components", None)
+        return found
+
     def rest_joints(self, params: Mapping[str, Any]) -> np.ndarray:
         """Joints (J, 3) of the model's own skeleton at rest, in its unit and axes.
 

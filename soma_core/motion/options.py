@@ -29,6 +29,7 @@ from soma_core.options import (
     Options,
     Picture,
     Product,
+    Refine,
     RotationLayout,
     RotationZero,
     SmplLayout,
@@ -163,6 +164,7 @@ class ConvertOptions(WriteOptions, FitOptions):
         carry: for models of the SMPL family: ``skeleton`` needs no model file, and reads no betas.
         mapping: file that says which joint of a skeleton is which, where its names are not known.
         root: of a file with several skeletons, the one that is read.
+        refine: ``joints`` brings hands and feet of another skeleton to where they are there; None: no.
         match: which bones of another skeleton are matched by direction: ``bones`` all, ``soles`` all but the
             slope of feet, ``limbs`` those of arms, legs and fingers; None: ``soles``, and ``limbs`` for the
             SMPL family.
@@ -174,6 +176,7 @@ class ConvertOptions(WriteOptions, FitOptions):
     mapping: str | None = None
     root: str | None = None
     match: BoneMatch | None = None
+    refine: Refine | None = None
     result: ConvertResult | None = None
     gender: BodyGender | None = None
     most_betas: int | None = None

@@ -291,6 +291,7 @@ _APPLY: dict[str, frozenset[str]] = dict.fromkeys(
     "mapping": frozenset({"skeleton"}),
     "root": frozenset({"skeleton"}),
     "match": _SMPL | {"skeleton"},
+    "refine": _SMPL | {"skeleton"},
 }  # fmt: skip
 """Settings that not every file takes, and the layouts that do."""
 

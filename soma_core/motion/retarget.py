@@ -31,10 +31,12 @@ class Retargeted:
     Attributes:
         motion: on this skeleton.
         report: which joint became which, what was left behind, unit, axes, and the scale of the path.
+        source: the other skeleton's motion in metres, +Y up.
     """
 
     motion: Motion
     report: Mapping[str, Any]
+    source: SkeletonMotion
 
 
 def retarget(
@@ -96,7 +98,7 @@ def retarget(
         "rest_pose": alignment.kind, "unit_metres": found.metres, "up": found.up, "legs_metres": legs,
         "path_scale": scale, "at_rest": [name for name in USER_JOINTS if name not in goals],
     }  # fmt: skip
-    return Retargeted(motion=motion, report=report)
+    return Retargeted(motion=motion, report=report, source=source)
 
 
 def _joints_report(

@@ -218,10 +218,14 @@ def test_the_axes_of_a_world_are_told_by_how_the_body_stands(tmp_path, caplog, r
     assert read(tmp_path, smplx_names(turns), up="+z").up == "+z"
 
 
-def test_hands_as_components_are_left_straight_and_said(tmp_path, caplog):
-    motion = read(tmp_path, smplx_names(TURNS, left_hand_pose=np.ones((FRAMES, 12))))
+def test_hands_as_components_are_kept_for_the_model(tmp_path):
+    left, right = np.ones((FRAMES, 12)), np.full((FRAMES, 6), 2.0)
+    motion = read(tmp_path, smplx_names(TURNS, left_hand_pose=left, right_hand_pose=right))
     assert not motion.rotations[:, 25:].any()
-    assert "12 numbers a frame are no rotations of 15 joints" in caplog.text
+    expected = np.concatenate([left, right, np.zeros((FRAMES, 6))], axis=1)
+    np.testing.assert_array_equal(motion.hand_components, expected)
+    assert not motion.flat_hands  # as the models' own code has it, unless the file says otherwise
+    assert not read(tmp_path, smplx_names(TURNS)).hand_components.size
 
 
 @pytest.mark.parametrize(

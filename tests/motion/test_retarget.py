@@ -19,10 +19,12 @@ from soma_core.io.skeleton_files import read_skeleton
 from soma_core.io.skeleton_motion import soma_skeleton
 from soma_core.layer import SomaLayer
 from soma_core.motion import ConvertOptions, FrameRange, convert_file, load_clip, write_body
+from soma_core.motion.carried import refined
 from soma_core.motion.retarget import retarget
 from tests.skeletons import along_axes, biped, in_another_pose, moved
 
 FLAT_DEGREES = 1.0
+REACHED = 1.5e-3  # [m]: a thousandth of a leg, see Limb.reach
 SAME_DEGREES = 0.05  # float32 rotations and seven decimals of a file; half a degree is what is asked
 
 LAFAN = {
@@ -318,3 +320,29 @@ def test_skinned_files_of_this_project_come_back_by_their_joints(name, tmp_path)
     found = retarget(read_skeleton(tmp_path / name)).motion
     np.testing.assert_allclose(found.rotations, motion.rotations, atol=1e-5)
     np.testing.assert_allclose(found.translation, motion.translation, atol=1e-5)
+
+
+@pytest.mark.parametrize("make", [mixamo_like, lafan_like, xsens_like], ids=["mixamo", "lafan", "xsens"])
+def test_hands_and_feet_come_to_where_they_are_there(make, rig):
+    """Within reach they are there to rounding; elsewhere the limb is stretched towards it."""
+    source = make()
+    found = retarget(source, match="soles")
+    refined_one = refined(found)
+    before, after = (soma_skeleton(each.motion, rig) for each in (found, refined_one))
+    turns = [each.turns() for each in (before, after)]
+    places = [each.positions() for each in (before, after)]
+    goals = found.source.positions() * found.report["path_scale"]
+    for name, (apart, left) in refined_one.report["refined_mm"].items():
+        index = USER_JOINTS.index(name)
+        goal = goals[:, found.source.names.index(found.report["joints"][name])]
+        missed = np.linalg.norm(places[1][:, index] - goal, axis=-1)
+        first = USER_JOINTS.index(name.replace("Hand", "Arm").replace("Foot", "Leg"))
+        reach = np.linalg.norm(np.diff(places[0][:, [first, first + 1, first + 2]], axis=1), axis=-1).sum(1)
+        within = np.linalg.norm(goal - places[0][:, first], axis=-1) < 0.99 * reach
+        assert within.mean() > 0.5
+        assert missed[within].max() < REACHED, name
+        assert left < apart
+        np.testing.assert_allclose(turns[1][:, index], turns[0][:, index], atol=1e-5)
+    for name in ("Hips", "Chest", "Head", "LeftShoulder"):
+        index = USER_JOINTS.index(name)
+        np.testing.assert_allclose(turns[1][:, index], turns[0][:, index], atol=1e-5)

@@ -24,6 +24,7 @@ class Backend:
     """What is asked of the user's model."""
 
     mean_hands = np.linspace(-1, 1, 90).reshape(30, 3)
+    hand_components = np.random.default_rng(1).standard_normal((2, 45, 45))
 
     def rest_joints(self, params):
         return np.array([PELVIS, [0, 0, 0]])
@@ -43,6 +44,32 @@ def test_fingers_are_relative_to_the_model_s_mean_hands_where_the_file_says_so()
     difference = relative["rotations"] - flat["rotations"]
     assert not difference[:, :22].any()
     np.testing.assert_allclose(difference[:, 22:], np.tile(Backend.mean_hands, (FRAMES, 1, 1)), atol=ROUNDING)
+
+
+@pytest.mark.parametrize("count", [6, 12, 24])
+@pytest.mark.parametrize("flat", [True, False])
+def test_fingers_turn_by_the_model_s_own_components(count, flat):
+    values = np.random.default_rng(2).standard_normal((FRAMES, 2 * count))
+    plain = _model_pose(Path("m"), motion(flat_hands=flat), Backend(), {})["rotations"]
+    found = _model_pose(Path("m"), motion(flat_hands=flat, hand_components=values), Backend(), {})[
+        "rotations"
+    ]
+    difference = found - plain
+    assert not difference[:, :22].any()
+    for side, rows in enumerate(np.split(values, 2, axis=1)):
+        expected = rows @ Backend.hand_components[side, :count]
+        fingers = difference[:, 22 + 15 * side : 37 + 15 * side].reshape(FRAMES, -1)
+        np.testing.assert_allclose(fingers, expected, atol=20 * ROUNDING)
+
+
+def test_without_components_fingers_stay_straight_and_the_file_is_asked_for(caplog):
+    backend = Backend()
+    backend.hand_components = None
+    values = {"flat_hands": False, "hand_components": np.ones((FRAMES, 12))}
+    found = _model_pose(Path("m"), motion(**values), backend, {})["rotations"]
+    np.testing.assert_array_equal(found, motion().rotations)
+    assert "hands are 6 components" in caplog.text
+    assert "soma backends convert smplh FILE" in caplog.text
 
 
 def test_a_model_without_mean_hands_is_named():

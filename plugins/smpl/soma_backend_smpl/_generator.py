@@ -67,6 +67,11 @@ class SmplGenerator:
         """Axis-angle vectors (30, 3) [rad] of the fingers' mean pose, where the model's file has it."""
         return None if self._model.mean_hands is None else self._model.mean_hands.reshape(30, 3)
 
+    @property
+    def hand_components(self) -> np.ndarray | None:
+        """Directions (2, n, 45) [rad] of the fingers of both hands, where the model's file has them."""
+        return self._model.hand_components
+
     def rest_joints(self, params: Mapping[str, Tensor]) -> Tensor:
         """Joints (batch, J, 3) [m] of the rest mesh, in the order of ``family.joint_names``."""
         return self._regressor @ self.rest(params)

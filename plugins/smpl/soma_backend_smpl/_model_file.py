@@ -16,6 +16,7 @@ __all__ = ["KEYS", "ModelFile", "read_model", "shape_width"]
 
 KEYS = ("v_template", "shapedirs", "posedirs", "J_regressor", "weights", "kintree_table", "f")
 HAND_KEYS = ("hands_meanl", "hands_meanr")
+COMPONENT_KEYS = ("hands_componentsl", "hands_componentsr")
 """Mean poses of the hands, which only files of SMPL-H and SMPL-X have."""
 _HEAD, _LEFT_HIP, _RIGHT_HIP = 15, 1, 2
 _SUM_TOLERANCE = 1e-4  # float32 weights of some influences
@@ -40,6 +41,8 @@ class ModelFile:
         faces: (t, 3) int64.
         mean_hands: (90,) axis-angle values of the fingers' mean pose, left hand first; None where there are
             none.
+        hand_components: (2, n, 45) directions of the fingers of both hands [rad], left first, n at most 45;
+            None where there are none.
     """
 
     family: Family
@@ -52,6 +55,7 @@ class ModelFile:
     weights: np.ndarray
     faces: np.ndarray
     mean_hands: np.ndarray | None = None
+    hand_components: np.ndarray | None = None
 
     def arrays(self) -> dict[str, np.ndarray]:
         """The arrays under the keys of the official files, in single precision."""
@@ -65,6 +69,8 @@ class ModelFile:
         }
         if self.mean_hands is not None:
             found |= dict(zip(HAND_KEYS, np.split(self.mean_hands, 2), strict=True))
+        if self.hand_components is not None:
+            found |= dict(zip(COMPONENT_KEYS, self.hand_components, strict=True))
         single = {key: value.astype(np.float32) for key, value in found.items()}
         return single | {"kintree_table": kintree, "f": self.faces.astype(np.int32)}
 
@@ -90,7 +96,8 @@ def read_model(path: Path, family: Family) -> ModelFile:
         AssetError: missing, damaged, code in a pickle, another model, or arrays that cannot be a body; the
             text names the key, what it holds and what was expected.
     """
-    arrays = _read(path, (*KEYS, *HAND_KEYS))
+    arrays = _read(path, (*KEYS, *HAND_KEYS, *COMPONENT_KEYS))
+    components = [arrays.pop(key, np.zeros(0)).astype(np.float64) for key in COMPONENT_KEYS]
     hands = [arrays.pop(key, np.zeros(0)).astype(np.float64).ravel() for key in HAND_KEYS]
     sound = all(hand.size == 45 and np.isfinite(hand).all() for hand in hands)
     _check_layouts(path, family, arrays)
@@ -118,9 +125,16 @@ def read_model(path: Path, family: Family) -> ModelFile:
         weights=values["weights"],
         faces=faces,
         mean_hands=np.concatenate(hands) if sound else None,
+        hand_components=np.stack(components) if _are_directions(components) else None,
     )
     _check_body(model, arrays["kintree_table"])
     return model
+
+
+def _are_directions(hands: list[np.ndarray]) -> bool:
+    left, right = hands
+    shaped = left.ndim == 2 and left.shape == right.shape and 0 < len(left) <= left.shape[1] == 45
+    return shaped and all(bool(np.isfinite(hand).all()) for hand in hands)
 
 
 def _refused(path: Path, family: Family, cause: str) -> AssetError:
