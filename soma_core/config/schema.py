@@ -83,9 +83,7 @@ class ViewConfig(ViewOptions):
     backend: BackendChoice = field(default_factory=_any_backend)
     beside: list[str] = field(default_factory=list)
     motion: str | None = None
-    motion_fps: float | None = None
-    motion_unit: LengthUnit | None = None
-    person: str | None = None
+    settings: str | None = None
     identity_from: IdentitySource = IdentitySource.backend
     compare: str | None = None
     translation: Translation = Translation.ground

@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING
 
 from omegaconf import OmegaConf
 
-from soma_core.motion.options import ConvertOptions
 from soma_core.viewer.page import Page
 from soma_core.viewer.server import close, open_server, serve
 from soma_core.viewer.session import Session
+from soma_core.viewer.sources import settings_of
 
 if TYPE_CHECKING:
     from omegaconf import DictConfig
@@ -32,7 +32,7 @@ def run(config: DictConfig, output: Path) -> None:
     options: ViewConfig = OmegaConf.to_object(config)
     server = open_server(options.host, options.port)
     try:
-        page = Page(server, open_session(options), output)
+        page = Page(server, open_session(options), output, settings=options.settings or "")
     except BaseException:
         close(server)
         raise
@@ -51,7 +51,7 @@ def open_session(options: ViewConfig) -> Session:
         _log.info("opening %s", name)
         own = {"params": chosen.params, "options": chosen.options} if name == chosen.name else {}
         session.add(name, **own)
-    settings = ConvertOptions(fps=options.motion_fps, unit=options.motion_unit, person=options.person)
+    settings = settings_of(options.settings or "")
     if options.motion is not None:
         session.load(options.motion, settings)
         if options.identity_from == "motion" or (options.compare and session.motion.identity):

@@ -53,10 +53,11 @@ class Page:
         server: of viser.
         session: what is shown.
         output: folder of what is saved.
+        settings: that files are read with.
     """
 
-    def __init__(self, server: Any, session: Session, output: Path) -> None:
-        self.server, self.session, self.output = server, session, output
+    def __init__(self, server: Any, session: Session, output: Path, settings: str = "") -> None:
+        self.server, self.session, self.output, self.settings = server, session, output, settings
         self.switches, self.watched = Switches(), True
         self._todo: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
         self.controls = Controls(self._todo.put)
@@ -126,7 +127,7 @@ class Page:
     def _make_motion(self, _: Any) -> None:
         self.handles["about"] = self.server.gui.add_markdown("")
         self._add("path", "text", "file", "", hint="on the machine where soma view runs")
-        self._add("settings", "text", "settings", "",
+        self._add("settings", "text", "settings", self.settings,
                   hint="of soma convert, where the file does not say: fps=30 unit=cm up=z")  # fmt: skip
         self._add("load", "button_group", "", ("load", "compare"), act=lambda what, _: self.load(
             Path(self.handles["path"].value), compare=what == "compare"))  # fmt: skip
@@ -258,15 +259,14 @@ class Page:
     def _free(self, stem: str, suffix: str) -> Path:
         """A path in the folder that is not taken yet."""
         number = 1
-        while (path := self.output / f"{stem}{'' if number == 1 else f'_{number}'}{suffix}").exists():
+        while (path := self.output / f"{stem}{'' if number == 1 else f'_{number}'}.{suffix}").exists():
             number += 1
         return path
 
     def _save(self, product: Product, client: Any) -> Path | None:
         if self.figure is None or self.figure.recorded is not None:
             return None
-        name = Path(WRITERS[product].file)
-        path = self._free(name.stem, name.suffix)
+        path = self._free(*WRITERS[product].file.rsplit("."))
         with self._busy(f"writing {path.name}"):
             self.session.write(self.figure, product, path)
         self._hand(path, client)
@@ -276,7 +276,7 @@ class Page:
         from PIL import Image
 
         pixels = client.get_render(*_PICTURE)
-        path = self._free("picture", ".png")
+        path = self._free("picture", "png")
         stream = io.BytesIO()
         Image.fromarray(np.ascontiguousarray(pixels[..., :3])).save(stream, "PNG")
         atomic_write(path, lambda target: target.write_bytes(stream.getvalue()))
