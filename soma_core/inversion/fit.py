@@ -58,9 +58,9 @@ _AS_GOOD = 1.1
 former: 0.7 to 1.08 on meshes of Anny's own rig. Of what the full model posed, only bodies that are wrong by
 some millimetres come below, and their angles are as good by either."""
 
-_COLLAPSED, _LEFT = 0.1, 0.25
-"""A joint whose cloud has less than this share of its extent left cannot be determined, nor one that a robust
-fit leaves less than this share of its weight."""
+_COLLAPSED, _LEFT = 0.1, 0.5
+"""A joint whose cloud has less than this share of its extent left cannot be determined; nor can one that a
+robust fit leaves less than this share of its weight, and those that turn against it."""
 
 
 class PoseInversion(Derived):
@@ -378,9 +378,10 @@ class PoseInversion(Derived):
         if vertices is not frames.vertices:
             error.masked_fill_(~torch.isfinite(frames.vertices).all(-1), torch.nan)
         kept = extent > _COLLAPSED
+        determined = self.model.determined(kept) & usable[:, None]
         if among is not None:
             kept = kept & (rest.own[..., 3, 3] > _LEFT * among.rest.own[..., 3, 3])
-        determined = self.model.determined(kept) & usable[:, None]
+            determined &= self.model.determined(kept, below=determined)
         residual = (energy / mass).sqrt()
         least = self.options.tolerance if self.ladder.plain else 0.0
         resting = (_RESTING_SHARE * residual).clamp_min(least)

@@ -130,14 +130,20 @@ class PoseModel(SkinModel):
             return problem.origin.new_ones(1)
         return self.correctives.scale(problem.identity.bind_world)
 
-    def determined(self, kept: Tensor) -> Tensor:
-        """Whether each user joint is determined, (F, J - 1), by which weighted joints (F, T) are."""
+    def determined(self, kept: Tensor, below: Tensor | None = None) -> Tensor:
+        """Whether each user joint is determined, (F, J - 1), by which weighted joints (F, T) are.
+
+        Joints right below one of `below` (F, J - 1) that is not determined now are not, either.
+        """
         count = self.solver.public_count
         known = kept.new_zeros(len(kept), self.solver.joint_count)
         known[:, self.moments.joints] = kept
         if self.driven is not None:  # a bone whose skin lies on twist joints is known by theirs
             known = known[:, :count] | _any_of(known[:, count:], self.driven.start, count)
-        return known[:, 1:]
+        if below is None:
+            return known[:, 1:]
+        lost = torch.nn.functional.pad(below, (1, 0)) & ~known[:, :count]
+        return (known[:, :count] & ~lost[:, self.solver.parents[:count]])[:, 1:]
 
     def angle_std(self, problem: Problem, pose: Pose, energy: Tensor) -> Tensor:
         """Standard deviations (F, J - 1) [degrees] of joint angles, where the noise is what is left.

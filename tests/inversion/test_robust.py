@@ -99,3 +99,16 @@ def test_a_temporal_prior_smooths_and_still_fits(layer, identity):
     assert jumps[1] < 0.7 * jumps[0]
     errors = [mean_error(layer, identity, one, steady) for one in results]
     assert errors[1] < errors[0]
+
+
+def test_what_turns_against_a_lost_joint_is_not_determined(layer, identity, clean):
+    """The upper arm is lost with all its skin: the forearm's turn against it cannot be told."""
+    names, weights = list(layer.rig.joint_names), torch.as_tensor(layer.rig.weights.toarray())
+    arm = weights[:, names.index("LeftArm")] > 0.1
+    away = torch.nn.functional.normalize(randn(*clean.shape, seed=9).float(), dim=-1)
+    result = PoseInversion(layer, robust=0.01)(clean + 0.4 * away * arm[:, None], identity)
+    upper, below, other = (
+        layer.joint_names.index(f"{name}") for name in ("LeftArm", "LeftForeArm", "RightForeArm")
+    )
+    assert not result.determined[:, [upper, below]].any()
+    assert result.determined[:, other].all()
