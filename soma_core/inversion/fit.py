@@ -331,9 +331,9 @@ class PoseInversion(Derived):
         if not len(rows):
             return result
         other = self.skinned("plain")
-        if frames.rest:
-            for model in other.ladder.models:
-                frames.rest.setdefault(model, model.prepared(frames.identity, frames.weights))
+        for model in other.ladder.models if frames.rest else ():
+            if model not in frames.rest:
+                frames.rest[model] = model.prepared(frames.identity, frames.weights)
         part, full = frames.part(rows), result.part(rows)
         plain, _ = other._fit(part)
         better = plain.mean_error(part.weights) < _AS_GOOD * full.mean_error(part.weights)
@@ -383,8 +383,7 @@ class PoseInversion(Derived):
             kept = kept & (rest.own[..., 3, 3] > _LEFT * among.rest.own[..., 3, 3])
             determined &= self.model.determined(kept, below=determined)
         residual = (energy / mass).sqrt()
-        least = self.options.tolerance if self.ladder.plain else 0.0
-        resting = (_RESTING_SHARE * residual).clamp_min(least)
+        resting = (_RESTING_SHARE * residual).clamp_min(self.options.tolerance if self.ladder.plain else 0.0)
         rests = (pose.last_change < resting) | (pose.last_change == 0)
         rests = rests & ~lopsided(error, problem.weights, residual)
         return InversionResult(
