@@ -130,15 +130,12 @@ class Converter:
         options = self._options
         with heard() as said:
             body = open_body(path, layout, options, self._backends)
-            settings = fit_settings(path, layout, body, options)
-            earlier = earlier_report(files.report, {"npz": files.motion}, settings)
-            if earlier is None:
-                plan = plan_body(path, layout, body, options, files, chunks)
+        earlier = _fitted_before(path, files, fit_settings(path, layout, body, options))
         if earlier is not None:
-            for warning in earlier.get("warnings", ()):
-                _log.warning("%s", warning)
-            _refuse_failed(path, earlier, files.report)
-            return Converted(report=earlier, files=files, earlier=True)
+            return earlier
+        with heard() as also:
+            plan = plan_body(path, layout, body, options, files, chunks)
+        said += also
         return _finished(FitJob(plan=replace(plan, warnings=tuple(said)), body=body))
 
     def _carry_over(self, path: Path, layout: Layout, files: ResultFiles, said: list[str]) -> Converted:
@@ -160,6 +157,23 @@ class Converter:
         }
         atomic_text(files.report, json.dumps(report, indent=2) + "\n")
         return Converted(report=report, files=files)
+
+
+def _fitted_before(path: Path, files: ResultFiles, settings: Mapping[str, Any]) -> Converted | None:
+    """What an earlier run with the same settings made of the file; its doubts are said again.
+
+    Raises:
+        InputError: the earlier run had other settings.
+        SomaError: its fit is none.
+    """
+    earlier = earlier_report(files.report, {"npz": files.motion}, settings)
+    if earlier is None:
+        return None
+    _log.info("%s: %s is by an earlier run with the same settings", path.name, files.motion)
+    for warning in earlier.get("warnings", ()):
+        _log.warning("%s", warning)
+    _refuse_failed(path, earlier, files.report)
+    return Converted(report=earlier, files=files, earlier=True)
 
 
 def _products_before(report: Path) -> Mapping[str, Any]:
@@ -233,6 +247,9 @@ def invert(source: str | Path, out: str | Path, *, options: InvertOptions | None
             "%s: %d frames of %d vertices (%s) at %g fps",
             source.name, shown.frame_count, shown.vertex_count, body.posed.topology, shown.fps,
         )  # fmt: skip
+        earlier = _fitted_before(source, files, fit_settings(source, "vertices", body, options))
+        if earlier is not None:
+            return earlier
         with heard() as also:
             plan = plan_body(source, "vertices", body, options, files, out / "chunks")
         return _finished(FitJob(plan=replace(plan, warnings=(*said, *also)), body=body))

@@ -101,3 +101,13 @@ def test_a_file_that_was_changed_since_is_refused_by_name_in_another_process(bod
     refused = pytest.raises(InputError, match="another file than when the fit was planned")
     with multiprocessing.get_context("spawn").Pool(1) as pool, refused:
         pool.apply(fit_chunks, (plan, 0))
+
+
+def test_a_finished_fit_is_left_alone_and_not_overwritten_with_other_settings(body, tmp_path):
+    options = InvertOptions(**SETTINGS)
+    invert(body, tmp_path / "out", options=options)
+    before = (tmp_path / "out/motion.npz").read_bytes()
+    assert invert(body, tmp_path / "out", options=options).earlier
+    with pytest.raises(InputError, match="fps"):
+        invert(body, tmp_path / "out", options=InvertOptions(**SETTINGS | {"fps": 30}))
+    assert (tmp_path / "out/motion.npz").read_bytes() == before
