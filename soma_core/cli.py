@@ -89,7 +89,7 @@ def _usage() -> str:
         [
             "usage: soma <task> [key=value ...]",
             "       soma backends [list | show NAME | check NAME | new NAME] [--json]",
-            "       soma assets [verify | path]",
+            "       soma assets [verify | show | use | path]",
             "       soma --version",
             "",
             "tasks (soma <task> --help shows what can be set):",
@@ -144,12 +144,23 @@ def _assets(arguments: Sequence[str]) -> int:
     verify = verbs.add_parser("verify", help="check every file against MANIFEST.json")
     verify.add_argument("--root", type=Path, default=assets_dir(), help="folder (default: %(default)s)")
     verbs.add_parser("path", help="print the folder")
+    show = verbs.add_parser("show", help="what a folder holds, what can be used of it, what is missing")
+    show.add_argument("root", type=Path, nargs="?", metavar="FOLDER", help="default: the one in use")
+    use = verbs.add_parser("use", help="use another folder from now on, such as the published assets of SOMA")
+    use.add_argument("root", metavar="FOLDER|shipped", help="the folder; shipped: that of this package")
     options = parser.parse_args(arguments)
     if options.verb == "path":
         _say(str(assets_dir()))
         return EXIT_OK
-    checked = importlib.import_module("soma_core.tasks.assets").verify_assets(options.root)
-    _say(f"{options.root}: {len(checked)} files are what MANIFEST.json says")
+    task = importlib.import_module("soma_core.tasks.assets")
+    if options.verb == "show":
+        _say("\n".join(task.show_assets(options.root)))
+    elif options.verb == "use":
+        _say(task.use_assets(options.root))
+    else:
+        checked = task.verify_assets(options.root)
+        state = "are what MANIFEST.json says" if (options.root / "MANIFEST.json").is_file() else "can be read"
+        _say(f"{options.root}: {len(checked)} files {state}")
     return EXIT_OK
 
 

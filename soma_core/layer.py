@@ -30,9 +30,11 @@ from soma_core.compiled import CompiledLayer
 from soma_core.correctives.model import find_correctives, load_correctives
 from soma_core.errors import InputError
 from soma_core.geometry.torch_func import untracked
+from soma_core.paths import expanded
 from soma_core.plugin.registry import Registry, default_registry
 from soma_core.points.part import PartialBodies, as_matrices
 from soma_core.rig import load_canonical
+from soma_core.rig.manifest import NEUTRAL_NAME
 from soma_core.rig.mesh import CanonicalMesh, Lod
 from soma_core.rig.skeleton import Rig
 from soma_core.skeleton.identity import Identity
@@ -67,6 +69,8 @@ class SomaLayer(PartialBodies):
         validate: check that matrices are rotations. Finiteness is checked on CPU only, since on CUDA
             that would wait for the device.
         canonical: another mesh and rig than the shipped ones.
+        assets: folder of SOMA's assets, such as the published ones; default: the one in use, see
+            ``soma assets show``. Correctives and the shapes of the `soma` backend are those of the folder.
         registry: where backends are looked up.
 
     Raises:
@@ -90,6 +94,7 @@ class SomaLayer(PartialBodies):
         correctives: Path | str | None = "auto",
         validate: bool = True,
         canonical: tuple[CanonicalMesh, Rig] | None = None,
+        assets: Path | str | None = None,
         registry: Registry | None = None,
     ) -> None:
         super().__init__(locals(), device, dtype)
@@ -99,10 +104,12 @@ class SomaLayer(PartialBodies):
         self.options = dict(options or {})
         self.kernels = kernels
         self.exact, self.repose, self.validate = exact, repose, validate
-        self.mesh, self.rig = canonical or load_canonical(lod)
+        self.mesh, self.rig = canonical or load_canonical(lod, expanded(assets) if assets else None)
+        if self.mesh.root is not None and backend == "soma":
+            self.options.setdefault("shape_space", str(self.mesh.root / NEUTRAL_NAME))
         self.procedural = procedural and self.rig.procedural is not None
         shipped = self.procedural and repose and canonical is None
-        self.correctives_file = find_correctives(correctives, shipped=shipped)
+        self.correctives_file = find_correctives(correctives, shipped=shipped, root=self.mesh.root)
         self._registry = registry or default_registry()
         self.spec = self._registry.spec(backend)
         self._build(self.device, dtype)
@@ -110,10 +117,10 @@ class SomaLayer(PartialBodies):
     def _build(self, device: torch.device, dtype: torch.dtype) -> None:
         self.device, self.dtype = device, dtype
         generator = self._registry.generator(self.backend, device=device, dtype=dtype, options=self.options)
-        wrap_mesh = self.mesh if self.mesh.lod == "mid" else load_canonical("mid")[0]
+        wrap_mesh = self.mesh if self.mesh.lod == "mid" else load_canonical("mid", self.mesh.root)[0]
         mesh, rig, reduction = self.mesh, self.rig, None
         if self.mesh.lod == "xlo":
-            mesh, rig = load_canonical("low")
+            mesh, rig = load_canonical("low", self.mesh.root)
             reduction = LodTransfer(mesh, self.mesh, device=device, dtype=dtype)
         self.rest_shape = make_rest_shape(
             self.spec, generator, mesh, rig, device=device, dtype=dtype, exact=self.exact,

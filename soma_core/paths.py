@@ -7,7 +7,16 @@ from pathlib import Path
 
 from soma_core.errors import InputError
 
-__all__ = ["assets_dir", "cache_dir", "configs_dir", "data_dir", "expanded"]
+__all__ = [
+    "assets_dir",
+    "assets_note",
+    "cache_dir",
+    "configs_dir",
+    "data_dir",
+    "expanded",
+    "model_folders",
+    "shipped_assets",
+]
 
 _PACKAGE = Path(__file__).resolve().parent
 
@@ -29,10 +38,26 @@ def _shipped(name: str) -> Path:
     return inside if inside.is_dir() else _PACKAGE.parent / name
 
 
+def shipped_assets() -> Path:
+    """Folder of the canonical assets that come with this package."""
+    return _shipped("assets")
+
+
+def assets_note() -> Path:
+    """Where ``soma assets use`` writes which folder is to be used instead of the shipped one."""
+    return data_dir() / "assets.txt"
+
+
 def assets_dir() -> Path:
-    """Folder of the canonical assets; the environment variable SOMA_ASSETS overrides it."""
+    """Folder of the canonical assets: SOMA_ASSETS, else that of ``soma assets use``, else the shipped one."""
     override = os.environ.get("SOMA_ASSETS")
-    return Path(override).expanduser() if override else _shipped("assets")
+    if override:
+        return Path(override).expanduser()
+    try:
+        named = assets_note().read_text(encoding="utf-8").strip()
+    except (OSError, UnicodeDecodeError, InputError):
+        named = ""
+    return Path(named) if named else shipped_assets()
 
 
 def configs_dir() -> Path:
@@ -59,6 +84,23 @@ def data_dir() -> Path:
         return Path(override).expanduser()
     base = os.environ.get("XDG_DATA_HOME")
     return (Path(base) if base else _home("SOMA_DATA_DIR") / ".local" / "share") / "soma_core"
+
+
+def model_folders(name: str) -> list[Path]:
+    """Folders of a model's files, in any case: that of `data_dir`, there or not yet, then others there are.
+
+    The published assets of SOMA, where they are in use, hold models and the wrap pairs that artists made.
+    """
+    roots = [data_dir(), *([assets_dir()] if assets_dir() != shipped_assets() else [])]
+    found = [
+        path
+        for root in roots
+        if root.is_dir()
+        for path in sorted(root.iterdir())
+        if path.name.lower() == name.lower() and path.is_dir()
+    ]
+    own = [path for path in found if path.parent == roots[0]]
+    return found if own else [roots[0] / name, *found]
 
 
 def _home(instead: str) -> Path:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import importlib.metadata
 import json
 import logging
@@ -29,7 +30,8 @@ _log = logging.getLogger(__name__)
 def _rig_revision() -> str:
     """Revision of the rig that the assets declare; empty where they are not built."""
     try:
-        return str(read_manifest(assets_dir()).rig_revision)
+        listed = read_manifest(assets_dir()).rig_revision
+        return listed or importlib.import_module("soma_core.rig.canonical").load_canonical()[1].revision
     except SomaError as error:
         _log.warning("the assets name no rig revision (%s); run: soma assets verify", error)
         return ""

@@ -100,19 +100,20 @@ def _bone_sum(bind_world: Tensor, above: Tensor) -> Tensor:
     return (places[:, 2:] - places[:, above]).norm(dim=-1).sum(1)
 
 
-def find_correctives(given: Path | str | None, *, shipped: bool) -> Path | None:
+def find_correctives(given: Path | str | None, *, shipped: bool, root: Path | None = None) -> Path | None:
     """The checkpoint that is used; None for none.
 
     Args:
         given: a file, None, or ``auto`` for the shipped one.
         shipped: whether ``auto`` may be the shipped one.
+        root: assets folder of the shipped one; default: the one in use.
 
     Raises:
         AssetError: a file that was named is not there, or the shipped one was changed.
     """
     if given is None or (given == "auto" and not shipped):
         return None
-    path = shipped_file(CORRECTIVES_NAME, fix=_RESTORE) if given == "auto" else Path(given)
+    path = shipped_file(CORRECTIVES_NAME, fix=_RESTORE, root=root) if given == "auto" else Path(given)
     if path.is_file():
         return path
     if given == "auto":

@@ -292,7 +292,7 @@ class PoseInversion(Derived):
     def _to_canonical(self) -> torch.nn.Module:
         """Native vertices to the canonical mesh; made when first asked for."""
         layer, wrap = self.layer, self.layer.spec.wrap
-        mid = layer.mesh if layer.mesh.lod == "mid" else load_canonical("mid")[0]
+        mid = layer.mesh if layer.mesh.lod == "mid" else load_canonical("mid", layer.mesh.root)[0]
         correspondence = None if wrap is None else load_correspondence(wrap, mid)
         return make_transfer(layer.spec, layer.mesh, correspondence, dtype=layer.dtype, device=layer.device)
 

@@ -45,7 +45,8 @@ class Ladder(torch.nn.Module):
         self.model = PoseModel(layer, plain=plain, warp=warp)
         self.coarse = self.skinned = self.model
         if not plain and layer.mesh.lod == "mid":
-            self.coarse = PoseModel(layer, plain=False, warp=warp, some=load_canonical("low")[0].mid_ids)
+            low = load_canonical("low", layer.mesh.root)[0]
+            self.coarse = PoseModel(layer, plain=False, warp=warp, some=low.mid_ids)
         paper = set(options.stages) - {"procrustes", "gauss_newton"}
         if paper and not plain:
             self.skinned = PoseModel(layer, plain=True, warp=warp)

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from soma_core.io.pickled_arrays import read_pickled_arrays
     from soma_core.npz import open_npz_file
     from soma_core.obj import read_obj, write_obj
-    from soma_core.paths import data_dir
+    from soma_core.paths import data_dir, model_folders
     from soma_core.plugin.checks import Check, CheckFailedError, Level, check
     from soma_core.plugin.errors import BrokenBackendError, PluginError
     from soma_core.plugin.hookspecs import hookimpl
@@ -77,6 +77,7 @@ __all__ = [
     "data_dir",
     "file_sha256",
     "hookimpl",
+    "model_folders",
     "open_npz_file",
     "read_obj",
     "read_pickled_arrays",
@@ -97,7 +98,7 @@ _HOMES = {
     "soma_core.plugin.registry": ["Registry"],
     "soma_core.plugin.errors": ["BrokenBackendError", "PluginError"],
     # Files of the user, read without running them, and what is derived from them
-    "soma_core.paths": ["data_dir"],
+    "soma_core.paths": ["data_dir", "model_folders"],
     "soma_core.cache": ["atomic_arrays", "atomic_write", "cached_arrays", "content_key", "file_sha256"],
     "soma_core.files": ["refuse_unreadable"],
     "soma_core.npz": ["open_npz_file"],

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
-from typing import get_args
+from typing import TYPE_CHECKING, get_args
 
 import numpy as np
 import scipy.sparse
@@ -13,7 +14,7 @@ from scipy.spatial import cKDTree
 from soma_core.cache import cached_arrays, content_key
 from soma_core.errors import AssetError, InputError
 from soma_core.geometry.mesh import split_polygons
-from soma_core.paths import assets_dir
+from soma_core.paths import assets_dir, shipped_assets
 from soma_core.rig.manifest import (
     NEUTRAL_NAME,
     PROCEDURAL_NAME,
@@ -24,16 +25,20 @@ from soma_core.rig.manifest import (
     verified_sha256,
 )
 from soma_core.rig.mesh import CanonicalMesh, Lod
-from soma_core.rig.neutral import SEGMENT_NAMES, read_topology
+from soma_core.rig.neutral import SEGMENT_NAMES, read_stored_rig, read_topology
 from soma_core.rig.procedural import ProceduralDefinition, ProceduralRig
 from soma_core.rig.procedural_json import read_procedural
 from soma_core.rig.revision import lod_revision
 from soma_core.rig.skeleton import Rig
 
+if TYPE_CHECKING:
+    from soma_core.rig.usd import UsdRig
+
 __all__ = ["load_canonical"]
 
-_LAYOUT = 2  # raise when the cached arrays change meaning
+_LAYOUT = 3  # raise when the cached arrays change meaning
 _SEGMENT = "segment_"
+_NO_TEXTURE = (np.empty((0, 2), np.float32), np.empty(0, np.int32))
 
 
 def _low_topology(topology: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
@@ -78,50 +83,96 @@ def _xlo_topology(
     return xlo
 
 
+def _skin(
+    root: Path, lod: Lod, topology: Mapping[str, np.ndarray], definition: ProceduralDefinition | None
+) -> UsdRig:
+    """The rig of one LOD, from the template, or from the arrays of the first releases."""
+    from soma_core.rig.usd import canonical_rig, read_usd_rig  # imports pxr, needed only without a cache
+
+    keep = None if definition is not None else read_procedural(shipped_assets() / PROCEDURAL_NAME).main_joints
+    triangles = topology["triangles"]
+    if (root / RIG_NAME).is_file():
+        return read_usd_rig(root / RIG_NAME, lod=lod, triangles=triangles, definition=definition, keep=keep)
+    stored = read_stored_rig(root / NEUTRAL_NAME)
+    if stored is None:
+        cause = f"holds no rig, and there is no {RIG_NAME} beside it"
+        raise AssetError(root / NEUTRAL_NAME, cause=cause, fix=f"Put {RIG_NAME} of the same release there")
+    if lod == "xlo":
+        cause = "is of a release that has no extra-low mesh"
+        raise AssetError(root / NEUTRAL_NAME, cause=cause, fix="Use lod=low, or the files of a newer release")
+    part = "" if lod == "mid" else "_low"
+    polygons = (topology[f"face_vert_indices{part}"], topology[f"face_vert_counts{part}"])
+    if lod == "low":
+        ids = topology["lod_mid_to_low"]
+        stored = replace(stored, bind_shape=stored.bind_shape[ids], weights=stored.weights[ids])
+    texture = (topology["uv_coord_st"], topology["uv_indices_st"]) if lod == "mid" else _NO_TEXTURE
+    return canonical_rig(root / NEUTRAL_NAME, stored, (*polygons, *texture), triangles, definition, keep)
+
+
 def _parse(
-    root: Path, lod: Lod, manifest: Manifest, definition: ProceduralDefinition
+    root: Path, lod: Lod, manifest: Manifest, definition: ProceduralDefinition | None
 ) -> dict[str, np.ndarray]:
     """Read mesh and rig and flatten what one LOD needs into arrays."""
-    from soma_core.rig.usd import read_usd_rig  # imports pxr, needed only without a cache
-
-    topology = read_topology(root / NEUTRAL_NAME)
-    found = read_usd_rig(root / RIG_NAME, lod=lod, triangles=topology["triangles"], definition=definition)
-    if lod == "mid" and found.rig_hash != manifest.rig_hash:
+    instead = None if manifest.listed else shipped_assets() / NEUTRAL_NAME
+    topology = read_topology(root / NEUTRAL_NAME, instead=instead)
+    found = _skin(root, lod, topology, definition)
+    if manifest.listed and lod == "mid" and found.rig_hash != manifest.rig_hash:
         cause = f"rig revision is {found.rig.revision}, the manifest says {manifest.rig_revision}"
         raise AssetError(root / RIG_NAME, cause=cause, fix=RESTORE)
     rig, procedural = found.rig, found.rig.procedural
-    assert procedural is not None
+    _refuse_another_mesh(root, lod, topology, rig)
     if lod == "xlo":
         low = load_canonical("low", root)[0]
         arrays = _xlo_topology(rig.bind_shape, found.face_vert_indices, found.face_vert_counts, low)
     else:
         arrays = _mid_topology(topology) if lod == "mid" else _low_topology(topology)
-    return arrays | {
-        "joint_names": np.array(rig.joint_names),
-        "parents": rig.parents,
-        "bind_world": rig.bind_world,
-        "t_pose_world": rig.t_pose_world,
-        "bind_shape": rig.bind_shape,
-        "weights_data": rig.weights.data,
-        "weights_indices": rig.weights.indices,
-        "weights_indptr": rig.weights.indptr,
-        "helper_start": procedural.start_joints,
-        "helper_bind_world": procedural.bind_world,
-        "helper_weights_data": procedural.weights.data,
-        "helper_weights_indices": procedural.weights.indices,
-        "helper_weights_indptr": procedural.weights.indptr,
-        "face_vert_indices": found.face_vert_indices,
-        "face_vert_counts": found.face_vert_counts,
-        "uv": found.uv,
-        "uv_indices": found.uv_indices,
-    }
+    return (
+        arrays
+        | {
+            "joint_names": np.array(rig.joint_names),
+            "parents": rig.parents,
+            "bind_world": rig.bind_world,
+            "t_pose_world": rig.t_pose_world,
+            "bind_shape": rig.bind_shape,
+            "weights_data": rig.weights.data,
+            "weights_indices": rig.weights.indices,
+            "weights_indptr": rig.weights.indptr,
+            "rig_hash": np.array(found.rig_hash),
+            "face_vert_indices": found.face_vert_indices,
+            "face_vert_counts": found.face_vert_counts,
+            "uv": found.uv,
+            "uv_indices": found.uv_indices,
+        }
+        | (
+            {}
+            if procedural is None
+            else {
+                "helper_start": procedural.start_joints,
+                "helper_bind_world": procedural.bind_world,
+                "helper_weights_data": procedural.weights.data,
+                "helper_weights_indices": procedural.weights.indices,
+                "helper_weights_indptr": procedural.weights.indptr,
+            }
+        )
+    )
+
+
+def _refuse_another_mesh(root: Path, lod: Lod, topology: Mapping[str, np.ndarray], rig: Rig) -> None:
+    """The skin must be the mesh of the topology."""
+    counts = {"mid": len(topology["mirror_vert_indices"]), "low": len(topology["lod_mid_to_low"])}
+    found = len(rig.bind_shape)
+    if found != counts.get(lod, found):
+        cause = f"its {lod} skin has {found} vertices, {NEUTRAL_NAME} has {counts[lod]}"
+        raise AssetError(root / RIG_NAME, cause=cause, fix="Use files of one release together")
 
 
 def load_canonical(lod: Lod = "mid", root: Path | str | None = None) -> tuple[CanonicalMesh, Rig]:
     """Load the canonical mesh and rig in metres, +Y up; every array is read-only.
 
     The files are checked against the manifest on every call; what they hold is parsed once and
-    cached, keyed by their contents.
+    cached, keyed by their contents. A folder without a manifest, such as the published ones, names its rig
+    by its own hash; the rig is that of ``SOMA_template_rig.usda`` or, of the first releases, of
+    ``SOMA_neutral.npz``.
 
     Args:
         lod: "mid" (18,056 vertices), "low" (4,505, an index subset of mid) or "xlo" (612, a mesh of its own).
@@ -133,15 +184,22 @@ def load_canonical(lod: Lod = "mid", root: Path | str | None = None) -> tuple[Ca
     """
     if lod not in get_args(Lod):
         raise InputError("lod", got=repr(lod), expected="'mid', 'low' or 'xlo'", fix="Choose one of them.")
-    root = assets_dir() if root is None else Path(root)
+    given, root = root, assets_dir() if root is None else Path(root)
     manifest = read_manifest(root)
-    sums = [verified_sha256(root, manifest, name) for name in (RIG_NAME, NEUTRAL_NAME, PROCEDURAL_NAME)]
-    definition = read_procedural(root / PROCEDURAL_NAME)
-    key = content_key(_LAYOUT, lod, manifest.rig_hash, *sums)
+    names = (RIG_NAME, NEUTRAL_NAME, PROCEDURAL_NAME)
+    # The first releases have no template, and those without twist joints no definition of them.
+    names = names if manifest.listed else tuple(name for name in names if name in manifest.files)
+    sums = [verified_sha256(root, manifest, name) for name in names]
+    definition = read_procedural(root / PROCEDURAL_NAME) if PROCEDURAL_NAME in names else None
+    key = content_key(_LAYOUT, lod, manifest.rig_hash, *names, *sums)
     arrays = cached_arrays("canonical", key, lambda: _parse(root, lod, manifest, definition))
     for array in arrays.values():
         array.setflags(write=False)
-    return _assemble(arrays, lod, lod_revision(manifest.rig_hash, lod), definition)
+    revision = manifest.rig_hash or str(arrays["rig_hash"])
+    if not manifest.listed and lod != "mid":
+        revision = load_canonical("mid", root)[1].revision
+    mesh, rig = _assemble(arrays, lod, lod_revision(revision, lod), definition)
+    return (mesh if given is None else replace(mesh, root=root)), rig
 
 
 def _weights(arrays: Mapping[str, np.ndarray], prefix: str, columns: int) -> scipy.sparse.csr_array:
@@ -150,7 +208,7 @@ def _weights(arrays: Mapping[str, np.ndarray], prefix: str, columns: int) -> sci
 
 
 def _assemble(
-    arrays: Mapping[str, np.ndarray], lod: Lod, revision: str, definition: ProceduralDefinition
+    arrays: Mapping[str, np.ndarray], lod: Lod, revision: str, definition: ProceduralDefinition | None
 ) -> tuple[CanonicalMesh, Rig]:
     mesh = CanonicalMesh(
         vertices=arrays["bind_shape"],
@@ -166,12 +224,16 @@ def _assemble(
         revision=revision,
     )
     names = tuple(arrays["joint_names"].tolist())
-    procedural = ProceduralRig(
-        joint_names=definition.helpers,
-        start_joints=arrays["helper_start"],
-        bind_world=arrays["helper_bind_world"],
-        weights=_weights(arrays, "helper_weights", len(names) + len(definition.helpers)),
-        definition=definition,
+    procedural = (
+        None
+        if definition is None
+        else ProceduralRig(
+            joint_names=definition.helpers,
+            start_joints=arrays["helper_start"],
+            bind_world=arrays["helper_bind_world"],
+            weights=_weights(arrays, "helper_weights", len(names) + len(definition.helpers)),
+            definition=definition,
+        )
     )
     rig = Rig(
         joint_names=names,

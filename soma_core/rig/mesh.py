@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Literal
 
 import numpy as np
@@ -30,6 +31,7 @@ class CanonicalMesh:
         mid_ids: (v,) int32, id of each vertex in the mid LOD; empty for xlo, whose vertices are its own.
         lod: which level this is.
         revision: first 16 hex digits of the rig hash, with ``-low`` for a derived LOD.
+        root: the assets folder that it is from, where its other levels are; None: the one in use.
     """
 
     vertices: np.ndarray
@@ -43,6 +45,7 @@ class CanonicalMesh:
     mid_ids: np.ndarray
     lod: Lod
     revision: str
+    root: Path | None = None
 
     @property
     def vertex_count(self) -> int:

@@ -8,12 +8,15 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import scipy.sparse
 
 from soma_core.errors import AssetError, InputError
 from soma_core.json_file import parse_json
-from soma_core.npz import open_npz_file
+from soma_core.npz import NpzFile, open_npz_file
 from soma_core.paths import assets_dir
 from soma_core.rig.manifest import NEUTRAL_NAME, RESTORE, read_manifest, verified_sha256
+from soma_core.rig.stored import StoredRig, refuse_bad_weights
+from soma_core.stored_matrix import StoredMatrix
 
 __all__ = [
     "SEGMENT_NAMES",
@@ -21,6 +24,7 @@ __all__ = [
     "ShapeSpace",
     "load_shape_space",
     "read_arrays",
+    "read_stored_rig",
     "read_topology",
 ]
 
@@ -48,6 +52,16 @@ TOPOLOGY_KEYS = (
     "uv_indices_st",
     "uv_interp_st",
     *(f"segment_{name}" for name in SEGMENT_NAMES),
+)
+_DERIVED = tuple(name for name in TOPOLOGY_KEYS if name.startswith(("mirror", "uv", "segment")))
+"""What older files may lack: it follows from the numbers of the vertices, which all revisions share."""
+_RIG_KEYS = (
+    "joint_names",
+    "joint_parent_ids",
+    "bind_pose_world",
+    "t_pose_world",
+    "bind_shape",
+    *(f"skinning_weights_{part}" for part in ("data", "indices", "indptr", "shape")),
 )
 _SHAPE_KEYS = ("mean", "shapedirs", "eigenvalues")
 
@@ -147,15 +161,94 @@ def _read_metadata(path: Path, arrays: Mapping[str, np.ndarray]) -> dict[str, An
     return metadata
 
 
-def read_topology(path: Path) -> dict[str, np.ndarray]:
+def read_topology(path: Path, *, instead: Path | None = None) -> dict[str, np.ndarray]:
     """Read every array of `TOPOLOGY_KEYS`; extra keys (also those of old files) are ignored.
 
+    Args:
+        path: the file.
+        instead: a file of the same mesh, for mirror ids, texture coordinates and segments that are missing.
+
     Raises:
-        AssetError: unreadable file, missing keys, or metadata of another unit or axis.
+        AssetError: unreadable file, missing keys, ids that are no vertices, or another unit or axis.
     """
-    arrays = read_arrays(path, TOPOLOGY_KEYS)
+    with open_npz_file(path, fix=RESTORE) as file:
+        lacking = [] if instead is None else [name for name in _DERIVED if _empty(file, name)]
+    arrays = read_arrays(path, [name for name in TOPOLOGY_KEYS if name not in lacking])
     _read_metadata(path, arrays)
+    if lacking and instead is not None:
+        others = read_arrays(instead, TOPOLOGY_KEYS)
+        if not np.array_equal(others["face_vert_indices"], arrays["face_vert_indices"]):
+            cause = f"missing keys {lacking}, and its faces are not those of the canonical mesh"
+            raise AssetError(path, cause=cause, fix="Take the file of a newer release")
+        arrays |= {name: others[name] for name in lacking}
+    _refuse_wrong_ids(path, arrays)
     return {name: arrays[name] for name in TOPOLOGY_KEYS}
+
+
+def _empty(file: NpzFile, name: str) -> bool:
+    """Whether an array is missing, or a segment without vertices."""
+    return name not in file.names or (name.startswith("segment") and 0 in file.header(name).shape)
+
+
+def _refuse_wrong_ids(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
+    """Vertex ids, and corners of polygons, of both levels of detail."""
+    count, low = int(np.max(arrays["face_vert_indices"], initial=0)) + 1, len(arrays["lod_mid_to_low"])
+    limits = {name: low if name.endswith("_low") else count for name in TOPOLOGY_KEYS if "uv" not in name}
+    for name, limit in limits.items():
+        ids = arrays[name]
+        polygons = name.startswith("face_vert_counts")
+        good = np.issubdtype(ids.dtype, np.integer) and (not ids.size or ids.min() >= (3 if polygons else 0))
+        if not good or (ids.size and not polygons and ids.max() >= limit):
+            cause = f"{name} holds {ids.dtype} values that are no ids of {limit} vertices"
+            raise AssetError(path, cause=cause, fix="Take the file as it was published")
+    for part in ("", "_low"):
+        if arrays[f"face_vert_counts{part}"].sum() != len(arrays[f"face_vert_indices{part}"]):
+            cause = f"face_vert_counts{part} does not add up to the corners there are"
+            raise AssetError(path, cause=cause, fix="Take the file as it was published")
+
+
+def read_stored_rig(path: Path) -> StoredRig | None:
+    """The 78-joint rig that files of the first releases hold; None where the file has none.
+
+    Raises:
+        AssetError: arrays that do not fit together, or weights that are none.
+    """
+    with open_npz_file(path, fix=RESTORE) as file:
+        if not {*_RIG_KEYS} <= {*file.names}:
+            return None
+    found = read_arrays(path, _RIG_KEYS)
+    names, parents = found["joint_names"], np.array(found["joint_parent_ids"], np.int64)
+    points, worlds = found["bind_shape"], (found["bind_pose_world"], found["t_pose_world"])
+    count = len(names)
+    shapes = (len(points), count), (count, 4, 4)
+    parts = [found[f"skinning_weights_{part}"] for part in ("data", "indices", "indptr", "shape")]
+    fits = (
+        np.array_equal(parts[3], shapes[0])
+        and points.ndim == 2
+        and parents.shape == (count,)
+        and all(world.shape == shapes[1] and np.isfinite(world).all() for world in worlds)
+        and np.isfinite(points).all()
+        and bool(((parents >= 0) & (parents < count)).all())
+    )
+    if not fits:
+        raise AssetError(path, cause="the arrays of its rig do not fit together", fix="Take it as published")
+    # The root is its own parent there. Columns are joints: the matrix is compressed by them.
+    parents[parents == np.arange(count)] = -1
+    try:
+        stored = StoredMatrix(layout="csc", indices=(parts[2], parts[1]), values=parts[0], shape=shapes[0])
+        weights = scipy.sparse.csr_array(stored.csr(), dtype=np.float64)
+        weights.eliminate_zeros()
+    except ValueError as error:
+        raise AssetError(path, cause=f"skinning_weights: {error}", fix="Take it as published") from error
+    refuse_bad_weights(path, weights)
+    return StoredRig(
+        joint_names=tuple(str(name) for name in names),
+        parents=parents.astype(np.int32),
+        bind_world=np.array(worlds[0], np.float64),
+        t_pose_world=np.array(worlds[1], np.float64),
+        bind_shape=np.array(points, np.float64),
+        weights=weights,
+    )
 
 
 def load_shape_space(path: Path | str | None = None) -> ShapeSpace:

@@ -23,7 +23,7 @@ from soma_core.usd_stage import open_stage, usd_errors
 if TYPE_CHECKING:
     from pxr import Usd, UsdSkel
 
-__all__ = ["MESH_NAMES", "UsdRig", "read_usd_rig"]
+__all__ = ["MESH_NAMES", "UsdRig", "canonical_rig", "read_usd_rig"]
 
 MESH_NAMES: dict[str, tuple[str, ...]] = {
     "mid": ("c_skin_mid", "c_bodyRig_mid", "c_skin"),
@@ -254,6 +254,7 @@ def read_usd_rig(
     lod: Lod = "mid",
     triangles: np.ndarray | None = None,
     definition: ProceduralDefinition | None = None,
+    keep: Sequence[str] | None = None,
 ) -> UsdRig:
     """Read a rig from a UsdSkel file, converted to metres and +Y up.
 
@@ -268,6 +269,7 @@ def read_usd_rig(
         definition: which joints a pose controls and which are twist joints; the others are folded into
             their ancestors, and so are the twist joints for all but `Rig.procedural`. The hash is that of
             the folded rig. Default: every joint is one that a pose controls.
+        keep: the joints that a pose controls, where there is no definition; the others are folded likewise.
 
     Raises:
         AssetError: unreadable file, unknown mesh, missing restTransforms, unsupported up axis,
@@ -281,15 +283,37 @@ def read_usd_rig(
         stored = _read_stored(path, stage, skin)
         indices, counts = _polygons(path, skin, len(stored.bind_shape))
         uv, uv_indices = _texture(skin, len(indices))
-    public = stored if definition is None else public_rig(path, stored, definition)
-    digest = public.digest(_fan_triangles(indices, counts) if triangles is None else triangles)
+    polygons = indices, counts, uv, uv_indices
+    triangles = _fan_triangles(indices, counts) if triangles is None else triangles
+    return canonical_rig(path, stored, polygons, triangles, definition, keep, skin.GetName())
+
+
+def canonical_rig(
+    path: Path,
+    stored: StoredRig,
+    polygons: tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray],
+    triangles: np.ndarray,
+    definition: ProceduralDefinition | None = None,
+    keep: Sequence[str] | None = None,
+    mesh_name: str = "",
+) -> UsdRig:
+    """The rig of a file in metres, with the joints that a pose controls, as :func:`read_usd_rig` has it."""
+    missing = sorted({*(keep or ())} - {*stored.joint_names})
+    if definition is not None:
+        public = public_rig(path, stored, definition)
+    elif missing:
+        cause = f"the skeleton lacks {len(missing)} joints that a pose controls, first {missing[0]}"
+        raise AssetError(path, cause=cause, fix="Take a template of the SOMA rig")
+    else:
+        public = stored if keep is None else stored.keep(keep)
+    digest = public.digest(triangles)
     rig = public.metric(digest)
     return UsdRig(
         rig=rig if definition is None else with_helpers(rig, stored, definition),
         rig_hash=digest,
-        face_vert_indices=indices,
-        face_vert_counts=counts,
-        uv=uv,
-        uv_indices=uv_indices,
-        mesh_name=skin.GetName(),
+        face_vert_indices=polygons[0],
+        face_vert_counts=polygons[1],
+        uv=polygons[2],
+        uv_indices=polygons[3],
+        mesh_name=mesh_name,
     )

@@ -1,11 +1,15 @@
-"""Check the shipped assets (`soma assets verify`)."""
+"""Check the assets, tell what a folder of them holds, choose one (`soma assets`)."""
 
 from __future__ import annotations
 
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
-from soma_core.errors import AssetError
-from soma_core.paths import assets_dir
+from soma_core.cache import atomic_text
+from soma_core.errors import AssetError, SomaError
+from soma_core.paths import assets_dir, assets_note, expanded, model_folders, shipped_assets
 from soma_core.rig.manifest import (
     CORRECTIVES_NAME,
     MANIFEST_NAME,
@@ -13,11 +17,16 @@ from soma_core.rig.manifest import (
     PROCEDURAL_NAME,
     RESTORE,
     RIG_NAME,
+    Manifest,
     check_files,
     read_manifest,
+    verified_sha256,
 )
 
-__all__ = ["verify_assets"]
+__all__ = ["show_assets", "use_assets", "verify_assets"]
+
+_PUBLISHED = "https://huggingface.co/nvidia/soma-x"
+_MODELS = ("Anny", "GarmentMeasurements", "MHR", "SMPL", "SMPLX")
 
 _MAKERS = "make"  # in a checkout, the scripts that make the assets lie among them
 
@@ -78,6 +87,11 @@ def verify_assets(root: Path | None = None) -> list[str]:
     root = assets_dir() if root is None else Path(root)
     manifest = read_manifest(root)
     findings = check_files(root, manifest)
+    if not manifest.listed:
+        findings += _readable(root)
+        if findings:
+            raise AssetError(root, cause="; ".join(findings), fix=f"See `soma assets show {root}`")
+        return sorted(manifest.files)
     findings += [
         f"{root / MANIFEST_NAME}: does not list {name}. {RESTORE}"
         for name in (RIG_NAME, NEUTRAL_NAME, PROCEDURAL_NAME)
@@ -89,3 +103,144 @@ def verify_assets(root: Path | None = None) -> list[str]:
         cause = f"{len(findings)} finding{'s' if len(findings) > 1 else ''}\n  " + "\n  ".join(findings)
         raise AssetError(root, cause=cause, fix="Restore the files above")
     return sorted(manifest.files)
+
+
+def _readable(root: Path) -> list[str]:
+    """What cannot be read of a folder that no manifest describes."""
+    from soma_core.rig.canonical import load_canonical
+
+    findings = []
+    for check in (
+        lambda: load_canonical("mid", root),
+        lambda: load_canonical("low", root),
+        lambda: _correctives(root),
+    ):
+        try:
+            check()
+        except AssetError as error:
+            findings.append(str(error))
+    return findings
+
+
+def use_assets(folder: str) -> str:
+    """Remember which folder of assets is used from now on, ``shipped`` for that of the package.
+
+    Returns:
+        A sentence for the user.
+
+    Raises:
+        AssetError: a folder that cannot be read as assets; what was remembered stays.
+    """
+    if folder == "shipped":
+        assets_note().unlink(missing_ok=True)
+        return f"{shipped_assets()}: the shipped assets are used"
+    root = expanded(folder).resolve()
+    if root == shipped_assets().resolve():
+        return use_assets("shipped")
+    verify_assets(root)
+    assets_note().parent.mkdir(parents=True, exist_ok=True)
+    atomic_text(assets_note(), f"{root}\n")
+    override = os.environ.get("SOMA_ASSETS")
+    hidden = f"; SOMA_ASSETS={override} comes first as long as it is set" if override else ""
+    return f"{root}: used from now on, until `soma assets use shipped`{hidden}"
+
+
+@contextmanager
+def _using(root: Path) -> Iterator[None]:
+    """Let this process look into a folder of assets."""
+    before = os.environ.get("SOMA_ASSETS")
+    os.environ["SOMA_ASSETS"] = str(root)
+    try:
+        yield
+    finally:
+        if before is None:
+            del os.environ["SOMA_ASSETS"]
+        else:
+            os.environ["SOMA_ASSETS"] = before
+
+
+def show_assets(root: Path | None = None) -> list[str]:
+    """Tell in lines what a folder of assets holds, what can be used of it, and what is missing.
+
+    Args:
+        root: the folder; default: the one in use.
+
+    Raises:
+        AssetError: no folder of assets.
+    """
+    chosen = root is not None
+    root = assets_dir() if root is None else expanded(root)
+    manifest = read_manifest(root)
+    why = "SOMA_ASSETS" if os.environ.get("SOMA_ASSETS") else f"soma assets use, {assets_note()}"
+    why = "named" if chosen else "shipped" if root == shipped_assets() else why
+    lines = [f"folder       {root} ({why}; {'listed by a manifest' if manifest.listed else 'no manifest'})"]
+    with _using(root):
+        lines += [*_rig_lines(root), *_file_lines(root, manifest), *_model_lines()]
+    return lines
+
+
+def _rig_lines(root: Path) -> list[str]:
+    from soma_core.backends.native import component_count
+    from soma_core.rig.canonical import load_canonical
+
+    lines: list[str] = []
+    levels = []
+    for lod in ("mid", "low", "xlo"):
+        try:
+            mesh, rig = load_canonical(lod, root)
+        except AssetError as error:
+            levels.append(f"no {lod} ({error.cause.partition(';')[0]})")
+            continue
+        levels.append(f"{lod} {mesh.vertex_count:,}")
+        if lod == "mid":
+            helpers = 0 if rig.procedural is None else len(rig.procedural.joint_names)
+            twist = f"{helpers} twist joints" if helpers else "no twist joints, so no correctives"
+            source = RIG_NAME if (root / RIG_NAME).is_file() else NEUTRAL_NAME
+            lines = [f"rig          {rig.revision}, {rig.joint_count} joints, {twist}; from {source}"]
+    try:
+        count = f"{component_count(root / NEUTRAL_NAME)} components"
+    except AssetError as error:
+        count = f"none ({error.cause})"
+    return [*lines, f"vertices     {'; '.join(levels)}", f"shape space  {count}"]
+
+
+def _file_lines(root: Path, manifest: Manifest) -> list[str]:
+    lines = []
+    for name in (NEUTRAL_NAME, RIG_NAME, PROCEDURAL_NAME, CORRECTIVES_NAME):
+        state = f"missing; published at {_PUBLISHED}"
+        if name in manifest.files:
+            licence = manifest.files[name].get("licence", "Apache-2.0")
+            try:
+                verified_sha256(root, manifest, name)
+                state = f"{(root / name).stat().st_size / 2**20:.1f} MiB, {licence}"
+                if name == CORRECTIVES_NAME:
+                    _correctives(root)
+            except SomaError as error:
+                state = f"cannot be used: {error}"
+        lines.append(f"file         {name}: {state}")
+    return lines
+
+
+def _model_lines() -> list[str]:
+    """Model folders that are found, and what each installed backend still lacks."""
+    from soma_core.plugin.registry import default_registry
+
+    lines = [
+        f"models       {folder}: {', '.join(sorted(path.name for path in folder.iterdir())) or 'empty'}"
+        for name in _MODELS
+        for folder in model_folders(name)
+        if folder.is_dir()
+    ]
+    registry = default_registry()
+    for entry in registry.entries():
+        try:
+            spec = registry.spec(entry.name)
+        except SomaError as error:
+            lines.append(f"backend      {entry.name}: broken ({error})")
+            continue
+        lacking = [str(file.path) for file in spec.files if not file.path.is_file()]
+        state = (
+            f"lacks {', '.join(lacking)}; see `soma backends show {entry.name}`" if lacking else "can be used"
+        )
+        lines.append(f"backend      {entry.name}: {state} ({spec.licence})")
+    return lines

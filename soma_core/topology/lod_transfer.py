@@ -98,7 +98,7 @@ def offset_rows(mesh: CanonicalMesh) -> scipy.sparse.csr_array:
         columns = (3 * mesh.mid_ids.astype(np.int64)[:, None] + axes).ravel()
         entries = (np.ones(len(columns)), (np.arange(len(columns)), columns))
         return scipy.sparse.csr_array(entries)
-    low = load_canonical("low")[0]
+    low = load_canonical("low", mesh.root)[0]
     found = lod_correspondence(low, mesh)
     first, second, height = found.coordinates.T
     shares = np.stack([1 - first - second, first, second], 1)

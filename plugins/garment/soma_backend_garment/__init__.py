@@ -19,8 +19,8 @@ from soma_core.plugin import (
     Parameter,
     WrapPair,
     atomic_write,
-    data_dir,
     hookimpl,
+    model_folders,
 )
 
 if TYPE_CHECKING:
@@ -32,18 +32,21 @@ _URL = "https://github.com/mbotsch/GarmentMeasurements"
 _CONVERT = "soma backends convert garment point.pca"
 
 
-def _folder() -> Path:
-    return data_dir() / "GarmentMeasurements"
+def _place(*names: str) -> Path:
+    """The first folder that holds all of these files, or where they go."""
+    folders = model_folders("GarmentMeasurements")
+    return next((one for one in folders if all((one / name).is_file() for name in names)), folders[0])
 
 
 def _model() -> Path:
-    return _folder() / "point.npz"
+    return _place("point.npz") / "point.npz"
 
 
 @hookimpl
 def soma_backend() -> BackendSpec:
     """Declare the model and the files that only the user can supply."""
-    native, wrap = _folder() / "mean.obj", _folder() / "SOMA_wrap.obj"
+    pair = _place("mean.obj", "SOMA_wrap.obj")
+    native, wrap = pair / "mean.obj", pair / "SOMA_wrap.obj"
     return BackendSpec(
         name="garment",
         unit="m",
@@ -87,7 +90,7 @@ def soma_convert(source: Path, output: Path | None) -> Sequence[Path]:
     """Write ``point.npz`` of ``point.pca``, and copy ``mean.obj`` from beside it, where the backend looks."""
     from soma_backend_garment._point_pca import read_pca, write_npz
 
-    native, mean = _folder() / "mean.obj", source.with_name("mean.obj")
+    native, mean = _place("mean.obj") / "mean.obj", source.with_name("mean.obj")
     target = output or _model()
     if target.suffix.lower() != ".npz":
         raise InputError("--output", got=str(target), expected="an .npz", fix="Leave it out.")

@@ -5,12 +5,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from soma_core.plugin import WrapPair, data_dir
+from soma_core.plugin import WrapPair, model_folders
 
 __all__ = ["EXPRESSIONS", "IDENTITY", "JOINTS", "LOD1", "LOD6", "PARAMETERS", "VERTEX_COUNTS", "Lod"]
 
 IDENTITY, PARAMETERS, EXPRESSIONS, JOINTS = 45, 204, 72, 127
 """Widths of the three inputs of a file, and joints of the skeleton that it returns."""
+
+_FOLDER = "MHR"
 
 VERTEX_COUNTS = (73639, 18439, 10661, 4899, 2461, 971, 595)
 """Vertices of MHR by LOD."""
@@ -44,14 +46,17 @@ class Lod:
 
     def model(self) -> Path:
         """The model's file; the place of the first name where there is none."""
-        folder = _folder()
-        names = {path.name.lower(): path for path in folder.iterdir()} if folder.is_dir() else {}
-        return next((names[name] for name in self.models if name in names), folder / self.models[0])
+        folders = model_folders(_FOLDER)
+        files = [path for folder in folders if folder.is_dir() for path in folder.iterdir()]
+        names = {path.name.lower(): path for path in reversed(files)}
+        return next((names[name] for name in self.models if name in names), folders[0] / self.models[0])
 
     def pair(self) -> WrapPair:
         """The first pair that is complete, or the place of the last."""
-        pairs = [WrapPair(native=_folder() / native, wrap=_folder() / wrap) for native, wrap in self.pairs]
-        return next((pair for pair in pairs if pair.native.is_file() and pair.wrap.is_file()), pairs[-1])
+        folders = model_folders(_FOLDER)
+        pairs = [WrapPair(native=folder / a, wrap=folder / b) for folder in folders for a, b in self.pairs]
+        complete = (pair for pair in pairs if pair.native.is_file() and pair.wrap.is_file())
+        return next(complete, pairs[len(self.pairs) - 1])
 
 
 LOD1 = Lod(
@@ -77,10 +82,3 @@ LOD6 = Lod(
         ("lod6/mhr_lod6_neutral.obj", "lod6/SOMA_wrap.obj"),
     ),
 )
-
-
-def _folder() -> Path:
-    """The folder MHR of the data folder, in any case."""
-    root = data_dir()
-    found = sorted(path for path in root.iterdir() if path.name.lower() == "mhr") if root.is_dir() else []
-    return found[0] if found else root / "MHR"

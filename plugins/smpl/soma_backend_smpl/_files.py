@@ -6,7 +6,7 @@ import re
 from pathlib import Path
 
 from soma_backend_smpl.family import GENDERS, Family
-from soma_core.plugin import data_dir
+from soma_core.plugin import data_dir, model_folders
 
 __all__ = ["SUFFIXES", "canonical_path", "find_models", "gender_of", "wrap_paths"]
 
@@ -25,13 +25,13 @@ def gender_of(path: Path, *families: Family) -> str | None:
 
 
 def find_models(family: Family) -> dict[str, Path]:
-    """Gender -> file, for each model of the family in the data folder.
+    """Gender -> file, for each model of the family in the data folder, or else in published assets.
 
     The folder's own files come before those in its folders of a gender, ``.npz`` before ``.pkl``, and of
     two versions the newer.
     """
     found: dict[str, Path] = {}
-    for folder in _folders(data_dir(), family.folder):
+    for folder in filter(Path.is_dir, model_folders(family.folder)):
         files = [
             *folder.iterdir(),
             *(file for gender in GENDERS for file in (folder / gender).glob("model.*")),
@@ -40,13 +40,6 @@ def find_models(family: Family) -> dict[str, Path]:
         for file in sorted(files, key=lambda file: _preference(file, folder, family)):
             found.setdefault(gender_of(file, family) or "", file)
     return found
-
-
-def _folders(root: Path, name: str) -> list[Path]:
-    """Folders of that name in any case."""
-    if not root.is_dir():
-        return []
-    return sorted(path for path in root.iterdir() if path.name.lower() == name.lower() and path.is_dir())
 
 
 def _preference(file: Path, folder: Path, family: Family) -> tuple[object, ...]:
@@ -62,6 +55,7 @@ def canonical_path(family: Family, gender: str) -> Path:
 
 def wrap_paths(family: Family) -> tuple[Path, Path]:
     """The native mesh and the wrap: an official pair, or the one that ``soma wrap`` writes."""
-    root = data_dir()
-    folder = next(iter(_folders(root, family.wrap_folder)), root / family.wrap_folder)
-    return folder / "base_body.obj", folder / "SOMA_wrap.obj"
+    pairs = [
+        (folder / "base_body.obj", folder / "SOMA_wrap.obj") for folder in model_folders(family.wrap_folder)
+    ]
+    return next((pair for pair in pairs if all(path.is_file() for path in pair)), pairs[0])
