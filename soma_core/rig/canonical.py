@@ -92,7 +92,9 @@ def _skin(
     keep = None if definition is not None else read_procedural(shipped_assets() / PROCEDURAL_NAME).main_joints
     triangles = topology["triangles"]
     if (root / RIG_NAME).is_file():
-        return read_usd_rig(root / RIG_NAME, lod=lod, triangles=triangles, definition=definition, keep=keep)
+        found = read_usd_rig(root / RIG_NAME, lod=lod, triangles=triangles, definition=definition, keep=keep)
+        only_mid = lod == "low" and len(found.rig.bind_shape) == len(topology["mirror_vert_indices"])
+        return _low_of_mid(found, topology) if only_mid else found
     stored = read_stored_rig(root / NEUTRAL_NAME)
     if stored is None:
         cause = f"holds no rig, and there is no {RIG_NAME} beside it"
@@ -107,6 +109,22 @@ def _skin(
         stored = replace(stored, bind_shape=stored.bind_shape[ids], weights=stored.weights[ids])
     texture = (topology["uv_coord_st"], topology["uv_indices_st"]) if lod == "mid" else _NO_TEXTURE
     return canonical_rig(root / NEUTRAL_NAME, stored, (*polygons, *texture), triangles, definition, keep)
+
+
+def _low_of_mid(found: UsdRig, topology: Mapping[str, np.ndarray]) -> UsdRig:
+    """The low mesh of a template that holds the mid skin alone: a subset of its vertices."""
+    ids, rig = topology["lod_mid_to_low"], found.rig
+    helpers = rig.procedural
+    if helpers is not None:
+        helpers = replace(helpers, weights=helpers.weights[ids])
+    return replace(
+        found,
+        rig=replace(rig, bind_shape=rig.bind_shape[ids], weights=rig.weights[ids], procedural=helpers),
+        face_vert_indices=topology["face_vert_indices_low"],
+        face_vert_counts=topology["face_vert_counts_low"],
+        uv=_NO_TEXTURE[0],
+        uv_indices=_NO_TEXTURE[1],
+    )
 
 
 def _parse(
@@ -161,6 +179,9 @@ def _refuse_another_mesh(root: Path, lod: Lod, topology: Mapping[str, np.ndarray
     """The skin must be the mesh of the topology."""
     counts = {"mid": len(topology["mirror_vert_indices"]), "low": len(topology["lod_mid_to_low"])}
     found = len(rig.bind_shape)
+    if lod == "xlo" and found in counts.values():
+        cause = "has no extra-low mesh"
+        raise AssetError(root / RIG_NAME, cause=cause, fix="Use lod=low, or the files of a newer release")
     if found != counts.get(lod, found):
         cause = f"its {lod} skin has {found} vertices, {NEUTRAL_NAME} has {counts[lod]}"
         raise AssetError(root / RIG_NAME, cause=cause, fix="Use files of one release together")

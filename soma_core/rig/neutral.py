@@ -175,13 +175,14 @@ def read_topology(path: Path, *, instead: Path | None = None) -> dict[str, np.nd
         lacking = [] if instead is None else [name for name in _DERIVED if _empty(file, name)]
     arrays = read_arrays(path, [name for name in TOPOLOGY_KEYS if name not in lacking])
     _read_metadata(path, arrays)
+    if instead is not None:
+        _refuse_wrong_ids(path, arrays)
     if lacking and instead is not None:
         others = read_arrays(instead, TOPOLOGY_KEYS)
         if not np.array_equal(others["face_vert_indices"], arrays["face_vert_indices"]):
             cause = f"missing keys {lacking}, and its faces are not those of the canonical mesh"
             raise AssetError(path, cause=cause, fix="Take the file of a newer release")
         arrays |= {name: others[name] for name in lacking}
-    _refuse_wrong_ids(path, arrays)
     return {name: arrays[name] for name in TOPOLOGY_KEYS}
 
 
@@ -191,10 +192,10 @@ def _empty(file: NpzFile, name: str) -> bool:
 
 
 def _refuse_wrong_ids(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
-    """Vertex ids, and corners of polygons, of both levels of detail."""
+    """Vertex ids, and corners of polygons, of both levels of detail: no manifest vouches for them."""
     count, low = int(np.max(arrays["face_vert_indices"], initial=0)) + 1, len(arrays["lod_mid_to_low"])
     limits = {name: low if name.endswith("_low") else count for name in TOPOLOGY_KEYS if "uv" not in name}
-    for name, limit in limits.items():
+    for name, limit in ((name, limit) for name, limit in limits.items() if name in arrays):
         ids = arrays[name]
         polygons = name.startswith("face_vert_counts")
         good = np.issubdtype(ids.dtype, np.integer) and (not ids.size or ids.min() >= (3 if polygons else 0))

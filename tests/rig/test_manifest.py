@@ -27,7 +27,8 @@ def test_bad_manifests_are_refused(tmp_path, text, message):
         read_manifest(tmp_path)
 
 
-def test_missing_manifest_names_the_command(tmp_path):
+def test_missing_manifest_names_the_command(tmp_path, monkeypatch):
+    monkeypatch.setattr("soma_core.rig.manifest.shipped_assets", lambda: tmp_path)
     with pytest.raises(AssetError, match="git checkout -- assets"):
         read_manifest(tmp_path)
 
