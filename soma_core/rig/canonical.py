@@ -207,7 +207,7 @@ def load_canonical(lod: Lod = "mid", root: Path | str | None = None) -> tuple[Ca
         raise InputError("lod", got=repr(lod), expected="'mid', 'low' or 'xlo'", fix="Choose one of them.")
     given, root = root, assets_dir() if root is None else Path(root)
     manifest = read_manifest(root)
-    names = (RIG_NAME, NEUTRAL_NAME, PROCEDURAL_NAME)
+    names: tuple[str, ...] = (RIG_NAME, NEUTRAL_NAME, PROCEDURAL_NAME)
     # The first releases have no template, and those without twist joints no definition of them.
     names = names if manifest.listed else tuple(name for name in names if name in manifest.files)
     sums = [verified_sha256(root, manifest, name) for name in names]
