@@ -69,8 +69,7 @@ class SomaLayer(PartialBodies):
         validate: check that matrices are rotations. Finiteness is checked on CPU only, since on CUDA
             that would wait for the device.
         canonical: another mesh and rig than the shipped ones.
-        assets: folder of SOMA's assets, such as the published ones; default: the one in use, see
-            ``soma assets show``. Correctives and the shapes of the `soma` backend are those of the folder.
+        assets: folder of SOMA's assets with all that belongs to them; default: that of ``soma assets show``.
         registry: where backends are looked up.
 
     Raises:

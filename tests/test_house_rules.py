@@ -121,7 +121,7 @@ PUBLIC_NAMES = {
         Generator HasLinearBasis HasPoseVector HasPosed HasRandomPoses HasSkinning HasTriangles Level
         LinearBasis Parameter PluginError Registry SkinnedModel Unit WrapPair atomic_arrays atomic_write
         axis_angle_to_matrix
-        cached_arrays check closest_point_on_triangle content_key data_dir file_sha256 hookimpl
+        cached_arrays check closest_point_on_triangle content_key data_dir file_sha256 hookimpl model_folders
         open_npz_file read_obj read_pickled_arrays refuse_unreadable write_obj
     """,
     "soma_core.testing": """

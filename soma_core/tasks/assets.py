@@ -205,20 +205,20 @@ def _rig_lines(root: Path) -> list[str]:
 
 
 def _file_lines(root: Path, manifest: Manifest) -> list[str]:
-    lines = []
-    for name in (NEUTRAL_NAME, RIG_NAME, PROCEDURAL_NAME, CORRECTIVES_NAME):
-        state = f"missing; published at {_PUBLISHED}"
-        if name in manifest.files:
-            licence = manifest.files[name].get("licence", "Apache-2.0")
-            try:
-                verified_sha256(root, manifest, name)
-                state = f"{(root / name).stat().st_size / 2**20:.1f} MiB, {licence}"
-                if name == CORRECTIVES_NAME:
-                    _correctives(root)
-            except SomaError as error:
-                state = f"cannot be used: {error}"
-        lines.append(f"file         {name}: {state}")
-    return lines
+    def state(name: str) -> str:
+        if name not in manifest.files:
+            return f"missing; published at {_PUBLISHED}"
+        try:
+            verified_sha256(root, manifest, name)
+            if name == CORRECTIVES_NAME:
+                _correctives(root)
+        except SomaError as error:
+            return f"cannot be used: {error}"
+        licence = manifest.files[name].get("licence", "Apache-2.0")
+        return f"{(root / name).stat().st_size / 2**20:.1f} MiB, {licence}"
+
+    names = (NEUTRAL_NAME, RIG_NAME, PROCEDURAL_NAME, CORRECTIVES_NAME)
+    return [f"file         {name}: {state(name)}" for name in names]
 
 
 def _model_lines() -> list[str]:
