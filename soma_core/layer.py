@@ -99,9 +99,8 @@ class SomaLayer(PartialBodies):
         super().__init__(locals(), device, dtype)
         check_choice("lod", lod, get_args(Lod))
         check_choice("kernels", kernels, get_args(Kernels))
-        self.backend = backend
+        self.backend, self.kernels = backend, kernels
         self.options = dict(options or {})
-        self.kernels = kernels
         self.exact, self.repose, self.validate = exact, repose, validate
         self.mesh, self.rig = canonical or load_canonical(lod, expanded(assets) if assets else None)
         if self.mesh.root is not None and backend == "soma":
