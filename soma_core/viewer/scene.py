@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -21,6 +22,12 @@ _BONES = np.array([(USER_JOINTS.index(parent), USER_JOINTS.index(joint))
 _BONE, _JOINT = (38, 70, 140), (240, 190, 60)
 _GHOST = 0.45
 """Opacity of skin through which bones are seen."""
+
+_EYES = ("LeftEye", "RightEye")
+_BALL, _FRONT = 0.19, 0.15
+"""Radius of an eyeball, as a share of the distance of the eyes; how far before its joint it lies, of that."""
+
+_PUPIL, _IRIS, _WHITE = (24, 22, 22), (96, 74, 54), (236, 234, 230)
 
 _BANDS = 7
 """Colours of errors."""
@@ -104,6 +111,7 @@ class Scene:
                 root = self._root(figure)
                 root.position = self._shift + np.array([session.offset(figure), 0, 0])
                 self._mesh(figure, shape, visible=shown)
+                self._eyes(figure, shape, visible=switches.mesh)
                 self._bones(figure, shape)
                 self._names(figure, shape, visible=switches.names and first)
                 self._title(figure, shape)
@@ -151,6 +159,22 @@ class Scene:
         if visible:
             node.vertices = shape.vertices
             node.opacity = _GHOST if self.switches.skeleton or self.switches.names or compared else None
+
+    def _eyes(self, figure: Figure, shape: Shape, *, visible: bool) -> None:
+        """Eyeballs, which the mesh has not: no vertex hangs on the joints of the eyes, which turn unseen."""
+        if shape.joints is None or shape.turns is None:
+            return
+        left, right = (USER_JOINTS.index(name) for name in _EYES)
+        radius = _BALL * float(np.linalg.norm(shape.joints[left] - shape.joints[right]))
+        before = _FRONT * radius * shape.turns[USER_JOINTS.index("Head"), :, 2]
+        for index in (left, right):
+            path = self._path(figure, f"/eye{index}")
+            make = functools.partial(self._server.scene.add_mesh_trimesh, path)
+            node = self._node(path, lambda make=make: make(_eyeball()))
+            node.visible = visible
+            if visible:
+                node.scale, node.position = radius, shape.joints[index] + before
+                node.wxyz = _wxyz(shape.turns[index])
 
     def _bones(self, figure: Figure, shape: Shape) -> None:
         if shape.joints is None:
@@ -260,10 +284,25 @@ class Scene:
         index = USER_JOINTS.index(self.switches.joint)
         place = shape.joints[index] + self._shift + [self._session.offset(figure), 0, 0]
         if np.abs(_matrix(node.wxyz) - shape.turns[index]).max() > 1e-3:
-            x, y, z, w = Rotation.from_matrix(shape.turns[index]).as_quat()
-            node.wxyz = (w, x, y, z)
+            node.wxyz = _wxyz(shape.turns[index])
         if np.abs(np.asarray(node.position) - place).max() > 1e-4:
             node.position = place
+
+
+def _eyeball() -> Any:
+    """A ball of radius 1 that looks along +Z, with an iris."""
+    import trimesh
+
+    ball = trimesh.creation.icosphere(subdivisions=4)
+    off = np.degrees(np.arccos(np.clip(ball.vertices[:, 2], -1, 1)))
+    shades = np.select([off[:, None] < 12, off[:, None] < 27], [_PUPIL, _IRIS], _WHITE)
+    ball.visual.vertex_colors = np.column_stack([shades, np.full(len(shades), 255)]).astype(np.uint8)
+    return ball
+
+
+def _wxyz(turn: np.ndarray) -> tuple[float, ...]:
+    x, y, z, w = Rotation.from_matrix(turn).as_quat()
+    return float(w), float(x), float(y), float(z)
 
 
 def _matrix(wxyz: Any) -> np.ndarray:

@@ -15,6 +15,7 @@ import pytest
 
 from soma_core.errors import InputError, SomaError
 from soma_core.io import read_motion
+from soma_core.io.joint_order import USER_JOINTS
 from soma_core.motion.poses import named_pose
 from soma_core.options import Lod, Product, ViewOptions
 from soma_core.plugin.registry import default_registry
@@ -96,6 +97,17 @@ def test_controls_do_what_they_say(page):
     assert all(nodes[name].visible for name in ("/body0/bones", "/body0/name0", "gizmo"))
     place = page.session.shape(session.figures[0]).joints[13] + page.scene._shift
     np.testing.assert_allclose(nodes["gizmo"].position, place, atol=1e-4)
+
+
+def test_eyes_lie_in_their_sockets_and_turn_with_their_joints(page):
+    settle(page, seconds=0)
+    eye = page.scene._nodes[f"/body0/eye{USER_JOINTS.index('LeftEye')}"]
+    skin = page.scene._nodes["/body0/skin4505"].vertices
+    apart = np.linalg.norm(skin - eye.position, axis=1).min()
+    assert 0.8 < apart / eye.scale < 1.1
+    page.session.turn("LeftEye", np.array([0.0, 30.0, 0.0]))
+    page._draw(moving=False)
+    np.testing.assert_allclose(eye.wxyz, [np.cos(np.pi / 12), 0, np.sin(np.pi / 12), 0], atol=1e-4)
 
 
 def test_what_goes_wrong_is_said_and_the_page_goes_on(page, caplog):
