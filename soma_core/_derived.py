@@ -46,7 +46,7 @@ class Derived(torch.nn.Module):
         """Derive all constants, in place of those that are there."""
         raise NotImplementedError
 
-    def _apply(self, fn, recurse=True):  # noqa: ARG002 - PyTorch's signature
+    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:  # noqa: ARG002 - PyTorch's
         here = torch.empty(0, dtype=self.dtype, device=self.device)
         there = fn(here)
         dtype = there.dtype if there.dtype in _DTYPES else self.dtype
@@ -74,9 +74,9 @@ class Derived(torch.nn.Module):
         """Refused, as in :meth:`to`."""
         return self.to(torch.bfloat16)
 
-    def __reduce__(self):
+    def __reduce__(self) -> tuple[Any, ...]:
         kind = {"device": self.device, "dtype": self.dtype}
-        given = self._given | {name: value for name, value in kind.items() if name in self._given}
+        given: dict[str, Any] = self._given | {key: one for key, one in kind.items() if key in self._given}
         # copy.deepcopy copies these, which come first, and shares what the function holds, such as meshes.
         modules = {name: value for name, value in given.items() if isinstance(value, torch.nn.Module)}
         rest = {name: value for name, value in given.items() if name not in modules}
@@ -87,7 +87,7 @@ def own_precision(method: _Method) -> _Method:
     """Compute a method in its module's own precision, whatever ``torch.autocast`` says around it."""
 
     @functools.wraps(method)
-    def exact(self, *args, **kwargs):
+    def exact(self: Any, *args: Any, **kwargs: Any) -> Any:
         if not torch.is_autocast_enabled(self.device.type):
             return method(self, *args, **kwargs)
         with torch.autocast(self.device.type, enabled=False):

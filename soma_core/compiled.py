@@ -28,11 +28,17 @@ class _Layer(Protocol):
     spec: BackendSpec
     device: torch.device
     dtype: torch.dtype
-    joint_names: tuple[str, ...]
-    identity: Callable[..., Identity]
-    check_identity: Callable[[Identity], None]
-    pose: Callable[..., Posed]
-    forward: Callable[..., Posed]
+
+    @property
+    def joint_names(self) -> tuple[str, ...]: ...
+    @property
+    def identity(self) -> Callable[..., Identity]: ...
+    @property
+    def check_identity(self) -> Callable[[Identity], None]: ...
+    @property
+    def pose(self) -> Callable[..., Posed]: ...
+    @property
+    def forward(self) -> Callable[..., Posed]: ...
 
 
 class CompiledLayer:

@@ -277,13 +277,16 @@ class SomaLayer(PartialBodies):
         of the vertices is what twist joints and correctives add.
         """
         body = self._body(identity, rotations, translation, bone_scale)
-        pose, more = self.animation.pose, {}
         if self._fusible(*body[:4]):
             assert self.fused is not None
-            pose, more = self.fused, {"plain": self.animation}
-        else:
-            body = body._replace(relative=as_matrices(body.relative))
-        return pose(*body[:3], absolute=absolute, bone_scale=body.bone_scale, **more)
+            posed: Posed = self.fused(
+                *body[:3], absolute=absolute, bone_scale=body.bone_scale, plain=self.animation
+            )
+            return posed
+        turns = as_matrices(body.relative)
+        return self.animation.pose(
+            body.identity, turns, body.translation, absolute=absolute, bone_scale=body.bone_scale
+        )
 
     def _fusible(
         self, identity: Identity, relative: Tensor, translation: Tensor, bone_scale: Tensor | None

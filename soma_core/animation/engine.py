@@ -168,6 +168,7 @@ class Animation(torch.nn.Module):
             world.append(to_homogeneous(rotations, positions))
             start = stop
         joined = torch.cat(world)
+        assert vertices is not None
         return Posed(vertices=vertices, joints=joined[:, 1:, :3, 3], transforms=joined)
 
     def _skinning_transforms(

@@ -13,6 +13,7 @@ from soma_core.animation.engine import Animation, ProceduralAnimation
 from soma_core.animation.posed import Posed
 from soma_core.animation.twist import Twist
 from soma_core.correctives.model import Correctives
+from soma_core.geometry.constants import constant
 from soma_core.kernels._posing_text import BODY_INTS, BODY_REALS, JOINT_LIMIT
 from soma_core.kernels.patches import Patches, side_by_side
 from soma_core.skeleton.identity import Identity
@@ -51,8 +52,8 @@ class FusedPose(torch.nn.Module):
         weights = posing.posed_skinning.weights.scipy()
         self.helper_count = 0 if twist is None else len(twist.start)
         ints, reals = _body_tables(posing, twist, correctives, raw=not by_patches)
-        self.register_buffer("ints", torch.as_tensor(ints).to(device, torch.int32), persistent=False)
-        self.register_buffer("reals", torch.as_tensor(reals).to(device, dtype), persistent=False)
+        self.ints = constant(ints.astype(np.int32), device=device)
+        self.reals = constant(reals, device=device, dtype=dtype)
         self.active_count = int(ints[3])
         self.patches: Patches | None = None
         self.skin: Blend | None = None
@@ -103,6 +104,7 @@ class FusedPose(torch.nn.Module):
         if tables is None:
             from soma_core.kernels.body_skin_wp import skin_bodies
 
+            assert blend is not None
             added = None if active is None else self.added
             vertices = skin_bodies(identity.rest, skin, blend, features=active, added=added)
         else:
@@ -131,6 +133,7 @@ class FusedPose(torch.nn.Module):
         """
         from soma_core.kernels.body_skin_wp import skin_bodies
 
+        assert self.skin is not None
         vertices, found, start = None, [], 0
         for points, fitted, rotations, translation, bone_scale in bodies:
             if vertices is None:
@@ -215,7 +218,7 @@ def _body_tables(
         first + np.cumsum([0, *(tables[name].size for name in names)])[:-1]
         for names, first in ((BODY_INTS, header), (BODY_REALS, 0))
     ]
-    ints = (counts, *starts, *(tables[name].ravel() for name in BODY_INTS))
+    ints = [np.array(counts), *starts, *(tables[name].ravel() for name in BODY_INTS)]
     return np.concatenate(ints).astype(np.int64), np.concatenate([tables[n].ravel() for n in BODY_REALS])
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Iterator, Sequence
+from typing import Any
 
 import numpy as np
 import scipy.sparse
@@ -65,7 +66,7 @@ def _blend(points: Tensor, planes: Tensor, rows: bool, matrix: Sequence[Tensor])
 
 
 @_blend.register_fake
-def _(_points, planes, rows, matrix):
+def _(_points: Tensor, planes: Tensor, rows: bool, matrix: Sequence[Tensor]) -> Tensor:
     count, batch = matrix[0].shape[0] - 1, planes.shape[3]
     return planes.new_empty((batch, count, 3) if rows else (3, count, batch))
 
@@ -98,17 +99,19 @@ def _blend_backward(
 
 
 @_blend_backward.register_fake
-def _(_grad, points, planes, _rows, _matrix):
+def _(
+    _grad: Tensor, points: Tensor, planes: Tensor, _rows: bool, _matrix: Sequence[Tensor]
+) -> tuple[Tensor, Tensor]:
     dense = torch.contiguous_format
     return torch.empty_like(points, memory_format=dense), torch.empty_like(planes, memory_format=dense)
 
 
-def _save(ctx, inputs, output) -> None:  # noqa: ARG001 - PyTorch names its arguments
+def _save(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:  # noqa: ARG001 - PyTorch names its arguments
     points, planes, ctx.rows, matrix = inputs
     ctx.save_for_backward(points, planes, *matrix)
 
 
-def _backward(ctx, grad):
+def _backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
     points, planes, *matrix = ctx.saved_tensors
     gradients = torch.ops.soma_core.blend_backward(grad, points, planes, ctx.rows, matrix)
     return *gradients, None, [None] * len(matrix)

@@ -19,6 +19,7 @@ An angle jumps by a full turn where a joint turns through 180 degrees: no functi
 from __future__ import annotations
 
 import functools
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -104,7 +105,7 @@ class Twist(torch.nn.Module):
         self.eye = keep(np.eye(3))
         self._keep_channels(keep, rig)
 
-    def _keep_channels(self, keep, rig: Rig) -> None:
+    def _keep_channels(self, keep: Callable[[np.ndarray], Tensor], rig: Rig) -> None:
         """Tables of the channels in use, and the matrix (H, K) from channels to angles."""
         procedural = rig.procedural
         assert procedural is not None

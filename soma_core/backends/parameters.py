@@ -177,7 +177,7 @@ def _check_finite(tensors: Mapping[str, Tensor]) -> None:
     if not tensors or not all(map(may_look, tensors.values())):
         return
     # x * 0 is 0 for finite x and NaN otherwise; unlike a plain sum it cannot overflow.
-    probe = sum((tensor.detach() * 0).sum() for tensor in tensors.values())
+    probe = sum(((tensor.detach() * 0).sum() for tensor in tensors.values()), torch.zeros(()))
     if bool(torch.isfinite(probe)):
         return
     for name, tensor in tensors.items():

@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from soma_core.backends.parameters import batch_parameters
+from soma_core.geometry.constants import constant
 from soma_core.geometry.torch_func import untracked
 from soma_core.plugin.errors import PluginError, Stage
 from soma_core.plugin.spec import BackendSpec, Generator, HasLinearBasis, LinearBasis
@@ -93,19 +94,18 @@ class ComposedRestShape(torch.nn.Module):
         matrix, count = fit.matrix, len(composed.template) // 3
         kept = torch.arange(count, device=at.device) if reduction is None else reduction.source_ids
         self.vertex_count = len(kept)
-        self.register_buffer("template", _stack(matrix, composed.template[:, None], kept), persistent=False)
-        self.register_buffer("basis", _stack(matrix, composed.basis, kept), persistent=False)
+        self.template = constant(_stack(matrix, composed.template[:, None], kept), device=at.device)
+        self.basis = constant(_stack(matrix, composed.basis, kept), device=at.device)
         self.exact = composed.exact
         if self.exact is not None:
             place = torch.full((count,), self.vertex_count, device=at.device)
             place[kept] = torch.arange(self.vertex_count, device=at.device)
             place = place[self.exact.rows]
             chosen = torch.nonzero(place < self.vertex_count).squeeze(1)
-            self.register_buffer("offset_chosen", chosen, persistent=False)
-            self.register_buffer("offset_place", place[chosen], persistent=False)
+            self.offset_chosen = constant(chosen, device=at.device)
+            self.offset_place = constant(place[chosen], device=at.device)
             columns = matrix.tocsc()[:, self.exact.rows.cpu().numpy()].toarray()
-            tensor = torch.as_tensor(columns, dtype=self.basis.dtype, device=self.basis.device)
-            self.register_buffer("offset_moments", tensor, persistent=False)
+            self.offset_moments = constant(columns, device=at.device, dtype=self.basis.dtype)
 
     def forward(self, params: Mapping[str, Tensor]) -> tuple[Tensor, Tensor]:
         """Vertices as planes (3, v, B) [m] and fitted transforms (B, J, 4, 4) [m]."""

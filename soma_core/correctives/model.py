@@ -16,6 +16,7 @@ from soma_core.correctives.weights import (
     read_weights,
 )
 from soma_core.errors import AssetError
+from soma_core.geometry.constants import constant
 from soma_core.geometry.sparse import SparseRows
 from soma_core.rig.manifest import CORRECTIVES_NAME, RESTORE, shipped_file
 from soma_core.rig.mesh import CanonicalMesh
@@ -62,7 +63,7 @@ class Correctives(torch.nn.Module):
         self.owner = used // weights.channels
         # A tensor: a list is copied to a GPU at each call, and torch.compile knows no values of NumPy's.
         above = torch.as_tensor(rig.parents[2:].astype(np.int64), device=device)
-        self.register_buffer("above", above, persistent=False)
+        self.above = constant(above, device=device)
         self.length = float(skeleton_length(torch.as_tensor(rig.bind_world.copy())[None], rig))
 
     def scale(self, bind_world: Tensor) -> Tensor:

@@ -9,9 +9,9 @@ is touched, and none has to be assigned to one subtree.
 
 from __future__ import annotations
 
+import functools
 import itertools
 import re
-from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -19,6 +19,7 @@ import torch
 from torch import Tensor
 
 from soma_core.errors import InputError
+from soma_core.geometry.constants import constant
 from soma_core.geometry.kabsch import rotation_from_covariance
 from soma_core.geometry.tree import joint_levels
 from soma_core.inversion.gauss_newton import GaussNewton
@@ -83,12 +84,10 @@ class Level(torch.nn.Module):
         weighted = np.flatnonzero(rank[below] >= 0)
         self.hips = bool((structure.parents[moved] == 0).all())
         rows = rank[below[weighted]]
-        lists = {
-            "moved": moved, "below": below, "owner": owner, "weighted": weighted, "rows": rows,
-            "columns": (4 * rows[:, None] + np.arange(4)).ravel(),
-        }  # fmt: skip
-        for name, array in lists.items():
-            self.register_buffer(name, torch.as_tensor(array, device=device), persistent=False)
+        keep = functools.partial(constant, device=device)
+        self.moved, self.below, self.owner = keep(moved), keep(below), keep(owner)
+        self.weighted, self.rows = keep(weighted), keep(rows)
+        self.columns = keep((4 * rows[:, None] + np.arange(4)).ravel())
 
 
 def sweep_levels(
@@ -125,8 +124,7 @@ class Analytical(torch.nn.Module):
         self.body = sweep_levels(structure, np.setdiff1d(structure.variables, fingers), device=device)
         self.fingers = sweep_levels(structure, np.array(fingers, np.int64), device=device)
         self.full = sweep_levels(structure, structure.variables, device=device)
-        meeting = torch.as_tensor(_meeting_joints(structure), device=device)
-        self.register_buffer("meeting", meeting, persistent=False)
+        self.meeting = constant(_meeting_joints(structure), device=device)
 
     def forward(self, target: Tensor, rest: RestMoments, start: Pose) -> Pose:
         """Refine `start`; never worse than it.
@@ -146,7 +144,7 @@ class Analytical(torch.nn.Module):
     def sweep(
         self,
         pose: Pose,
-        levels: Iterable[Level],
+        levels: torch.nn.ModuleList,
         target: Tensor,
         rest: RestMoments,
         second: Tensor,
@@ -159,6 +157,7 @@ class Analytical(torch.nn.Module):
         relative, shift = pose.relative.clone(), pose.translation
         gained = torch.zeros_like(pose.last_change)
         for level in levels:
+            assert isinstance(level, Level)
             turn, step = _best_step(level, turns, places, residual, spread[:, level.moved])
             change = _change(level, turns, places, turn, step)
             block = second[:, level.columns][:, :, level.columns]

@@ -8,6 +8,7 @@ do not.
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields, is_dataclass, replace
@@ -19,6 +20,7 @@ from torch import Tensor
 
 from soma_core.animation.engine import Animation
 from soma_core.errors import InputError
+from soma_core.geometry.constants import constant
 from soma_core.inversion.gauss_newton import GaussNewton
 from soma_core.inversion.problem import Pose, Problem, part_of
 
@@ -143,8 +145,9 @@ class Autograd(torch.nn.Module):
                 )
         self.regions = {name: torch.as_tensor(regions[name]) for name in options.regions}
         with torch.inference_mode(mode=False):
-            for name in ("joints", "variables", "parents"):
-                self.register_buffer(name, _usable(getattr(solver, name)), persistent=False)
+            keep = functools.partial(constant, device=solver.joints.device)
+            self.joints, self.variables = keep(_usable(solver.joints)), keep(_usable(solver.variables))
+            self.parents = keep(_usable(solver.parents))
 
     def weighted(self, weights: Tensor) -> Tensor:
         """Vertex weights (..., v) times the factors of their regions."""
@@ -198,6 +201,7 @@ class Autograd(torch.nn.Module):
             value[chunk] if value is not None and len(value) > 1 else value
             for value in (problem.weights, problem.bone_scale)
         )
+        assert weights is not None
         total = weights.sum(1).clamp_min(torch.finfo(weights.dtype).tiny)
 
         def loss(turned: Tensor, shift: Tensor) -> Tensor:
@@ -251,6 +255,6 @@ def _usable(value: Any) -> Any:
     """The same value, of tensors that autograd may save: those made in inference mode are copied."""
     if isinstance(value, Tensor):
         return value.clone() if value.is_inference() else value
-    if not is_dataclass(value):
+    if not is_dataclass(value) or isinstance(value, type):
         return value
     return replace(value, **{one.name: _usable(getattr(value, one.name)) for one in fields(value)})

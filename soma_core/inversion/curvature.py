@@ -20,9 +20,9 @@ from soma_core.geometry.sparse import sparse_product
 
 if TYPE_CHECKING:
     from soma_core.geometry.sparse import SparseRows
+    from soma_core.inversion.gauss_newton import GaussNewton
     from soma_core.inversion.offsets import PoseOffsets
     from soma_core.inversion.problem import Activity, Pose, Problem
-    from soma_core.inversion.skin_equations import SkinEquations
     from soma_core.kernels.model_residual import ModelResidual
 
 __all__ = ["SkinCurvature", "in_float64", "problem_in_float64"]
@@ -51,8 +51,11 @@ class PosedSkin(Protocol):
         skin: weights (v, T); `residual`: compares poses with targets.
     """
 
-    solver: SkinEquations
-    offsets: PoseOffsets | None
+    @property
+    def solver(self) -> GaussNewton: ...
+
+    @property
+    def offsets(self) -> PoseOffsets | None: ...
 
     @property
     def skin(self) -> SparseRows: ...

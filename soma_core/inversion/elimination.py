@@ -7,10 +7,11 @@ parents), the translation last; fill then stays on chains towards the root.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping, Sized
 from dataclasses import dataclass
 
 import numpy as np
+import numpy.typing as npt
 
 from soma_core.inversion.structure import MomentStructure
 
@@ -146,12 +147,19 @@ def _fill(
         filled[b, a] = True
     for k in range(driven, len(columns)):
         rows = k + 1 + np.flatnonzero(filled[k + 1 :, k])
-        for i, a in enumerate(rows):
-            filled[rows[i:], a] = True
+        for i, row in enumerate(rows):
+            filled[rows[i:], row] = True
     return filled, pattern
 
 
-def _pushes(k, structure, columns, column_of, pattern, slot) -> list[tuple[int, int]]:
+def _pushes(
+    k: int,
+    structure: MomentStructure,
+    columns: np.ndarray,
+    column_of: np.ndarray,
+    pattern: np.ndarray,
+    slot: Mapping[tuple[int, int], int],
+) -> list[tuple[int, int]]:
     """(source, target) slots of the rows that column k hands to its parent's column."""
     above = column_of[structure.parents[columns[k]]]
     if above < 0:
@@ -160,9 +168,9 @@ def _pushes(k, structure, columns, column_of, pattern, slot) -> list[tuple[int, 
     return [(slot[int(r), k], slot[int(r), int(above)]) for r in rows]
 
 
-def _starts(lists) -> np.ndarray:
+def _starts(lists: Iterable[Sized]) -> np.ndarray:
     return np.concatenate([[0], np.cumsum([len(one) for one in lists])])
 
 
-def _ints(values) -> np.ndarray:
+def _ints(values: npt.ArrayLike) -> np.ndarray:
     return np.ascontiguousarray(values, dtype=np.int32)

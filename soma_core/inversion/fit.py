@@ -13,6 +13,7 @@ from torch import Tensor
 from soma_core._derived import Derived, own_precision
 from soma_core._inputs import check_bone_scale, check_choice
 from soma_core.errors import InputError
+from soma_core.geometry.constants import constant
 from soma_core.inversion._inputs import (
     check_vertices,
     check_weights,
@@ -114,13 +115,12 @@ class PoseInversion(Derived):
         self.device, self.dtype = device, dtype
         self.warp = self.kernels != "torch"
         self.ladder = Ladder(layer, self.options, warp=self.warp)
-        kind = {"dtype": dtype, "device": device}
         names = layer.rig.joint_names
         variables = [names[j] for j in self.model.solver.variables.tolist()]
-        self.terms = joint_terms(self.priors, variables, **kind)
-        self.doubt = twist_doubt(self.priors, variables, **kind) if self.model.driven is not None else None
-        fitted = torch.as_tensor(self.model.fitted, device=device)
-        self.register_buffer("default_weights", fitted.to(dtype), persistent=False)
+        self.terms = joint_terms(self.priors, variables, dtype=dtype, device=device)
+        doubtful = self.model.driven is not None
+        self.doubt = twist_doubt(self.priors, variables, dtype=dtype, device=device) if doubtful else None
+        self.default_weights = constant(self.model.fitted.astype(float), device=device, dtype=dtype)
         self.__dict__.pop("_to_canonical", None)
         self._twins: dict[str, PoseInversion] = {}
 

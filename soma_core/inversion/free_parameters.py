@@ -11,6 +11,7 @@ from scipy.stats import qmc
 from torch import Tensor
 
 from soma_core.errors import InputError
+from soma_core.geometry.constants import Kind
 from soma_core.layer import SomaLayer
 from soma_core.plugin.spec import Parameter
 from soma_core.skeleton.identity import Identity
@@ -113,7 +114,7 @@ class FreeParameters:
     def params(self, points: np.ndarray) -> dict[str, Tensor]:
         """Parameters of (m, k) points, each (m, *shape)."""
         values = self._default + self._unit * points
-        kind = {"dtype": self._layer.dtype, "device": self._layer.device}
+        kind: Kind = {"dtype": self._layer.dtype, "device": self._layer.device}
         result = {name: value.expand(len(points), *value.shape[1:]) for name, value in self._given.items()}
         first = 0
         for parameter in self._free:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -71,14 +72,16 @@ def attach_gradient(
 
 class _Implicit(torch.autograd.Function):
     @staticmethod
-    def forward(ctx, _vertices, rotations, translation, parts):
+    def forward(
+        ctx: Any, _vertices: Tensor, rotations: Tensor, translation: Tensor, parts: Any
+    ) -> tuple[Tensor, Tensor]:
         ctx.parts = parts
         ctx.save_for_backward(rotations, translation)
         return rotations.clone(), translation.clone()
 
     @staticmethod
     @torch.autograd.function.once_differentiable
-    def backward(ctx, by_rotations, by_translation):
+    def backward(ctx: Any, by_rotations: Tensor, by_translation: Tensor) -> tuple[Tensor, None, None, None]:
         model, problem, valid = ctx.parts
         frames = *ctx.saved_tensors, by_rotations, by_translation, valid
         grads, states = [], []

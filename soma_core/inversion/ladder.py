@@ -7,6 +7,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
+from soma_core.geometry.constants import Kind
 from soma_core.inversion.analytical import Analytical
 from soma_core.inversion.autograd import Autograd
 from soma_core.inversion.model import PoseModel
@@ -53,7 +54,7 @@ class Ladder(torch.nn.Module):
         self.plain, self.whole = plain, WholeFit(self.coarse, self.model, options)
         solver, structure = self.skinned.solver, self.skinned.structure
         if "transfer" in options.stages:
-            kind = {"dtype": layer.dtype, "device": layer.device}
+            kind: Kind = {"dtype": layer.dtype, "device": layer.device}
             self.skeleton = SkeletonTransfer(structure, layer.mesh, layer.rig, **kind)
         if "analytical" in options.stages:
             self.analytical = Analytical(structure, layer.rig, solver, options=options.analytical)

@@ -245,6 +245,7 @@ class TwistShare:
         Helpers lie on the bone, so that each turns in place by one angle, and the error is a polynomial in
         its sine and cosine.
         """
+        assert view.residual is not None
         mix = self.driven.mix[limb.helpers][:, list(limb.channels)].T
         twists, clear = self._twists(limb, torch.cat((angle, angle[:1] * 0)), view, rest)  # (F, a + 1, 2)
         spin = (twists[:, :-1] - twists[:, -1:]) @ mix + angle[:, None]  # (F, a, h)

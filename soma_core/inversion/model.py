@@ -8,13 +8,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from soma_core.geometry.constants import Kind
 from soma_core.inversion.driven import DrivenJoints, rig_with_helpers
 from soma_core.inversion.limbs import LimbStart, TwistShare
 from soma_core.inversion.moments import RestMoments
 from soma_core.inversion.offsets import PoseOffsets
 from soma_core.inversion.priors import JointTerms
 from soma_core.inversion.problem import Pose, Problem
-from soma_core.inversion.skin_model import Kind, SkinModel
+from soma_core.inversion.skin_model import SkinModel
 from soma_core.inversion.structure import skin_structure
 from soma_core.layer import SomaLayer
 from soma_core.rig.skeleton import Rig

@@ -134,17 +134,17 @@ class SkinMoments(torch.nn.Module):
                 local=local, weight=weight.to(self.dtype), own=own, second=second, offsets=offsets
             )
         local = self.local_points(identity).expand(batch, -1, 3)
-        second, own = [], []
+        seconds, owns = [], []
         for points, weight_v, weight_vt in zip(local, vertex_weight, weight, strict=True):
             point = torch.cat((points, torch.ones_like(points[:, :1])), 1)
-            second.append(self._second(point * self.influence_weight[:, None], weight_v))
+            seconds.append(self._second(point * self.influence_weight[:, None], weight_v))
             outer = point[:, :, None] * (point * weight_vt[:, None])[:, None]
-            own.append(_sum_rows(outer.flatten(1), self.joint_start).unflatten(1, (4, 4)))
+            owns.append(_sum_rows(outer.flatten(1), self.joint_start).unflatten(1, (4, 4)))
         return RestMoments(
             local=local.to(self.dtype),
             weight=weight.to(self.dtype),
-            own=torch.stack(own).to(self.dtype),
-            second=torch.stack(second).to(self.dtype),
+            own=torch.stack(owns).to(self.dtype),
+            second=torch.stack(seconds).to(self.dtype),
             offsets=offsets,
         )
 

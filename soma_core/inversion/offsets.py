@@ -77,21 +77,19 @@ class PoseOffsets(torch.nn.Module):
     ) -> None:
         super().__init__()
         self.squash, self.columns = squash, still.shape[-1]
-        kind = {"dtype": dtype, "device": device}
-        self.first = None if first is None else SparseRows(first, **kind)
-        self.shapes = SparseRows(shapes, **kind)
-
+        self.first = None if first is None else SparseRows(first, dtype=dtype, device=device)
+        self.shapes = SparseRows(shapes, dtype=dtype, device=device)
         keep = functools.partial(constant, device=device, dtype=dtype)
         self.left = keep(left)
         self.right = keep(right)
         self.still = keep(still)
         blocks = _blocks(first, owner, len(left), 3 * self.columns)
-        for name, array in blocks.items():
-            setattr(self, name, keep(array))
+        self.taken, self.reads, self.gate = (keep(blocks[name]) for name in ("taken", "reads", "gate"))
         modes, moved = _modes(shapes, blocks["taken"], fitted)
         self.modes = keep(modes)
-        for name, array in _moments(moved, rig, joints, fitted).items():
-            setattr(self, name, keep(array))
+        made = {name: keep(array) for name, array in _moments(moved, rig, joints, fitted).items()}
+        self.gram, self.torque, self.force = made["gram"], made["torque"], made["force"]
+        self.extent, self.mass = made["extent"], made["mass"]
 
     @classmethod
     def of_correctives(
@@ -174,6 +172,7 @@ class PoseOffsets(torch.nn.Module):
             above: (F, J, 3, 3) world turns of the parents.
         """
         if self.first is not None:
+            assert activity.slope is not None
             pull = self.first.pull_back(_paired(pull * activity.slope))[: len(pull)]
         by_feature = pull.unflatten(1, (-1, 3, self.columns))
         by_rotation = self.left.mT @ by_feature @ self.right[..., : self.columns].mT
@@ -311,14 +310,16 @@ def _modes(
         found.append(vectors[:, kept].T)
     width = max(map(len, found))
     modes = np.zeros((len(taken), width, taken.shape[1]))
-    columns, rows, values = [], [], []
+    columns, rows, weights = [], [], []
     for p, (row, part) in enumerate(zip(taken, found, strict=True)):
         ids = row[row < shapes.shape[1]]
         modes[p, : len(part), : len(ids)] = part
         k, c = np.meshgrid(p * width + np.arange(len(part)), ids, indexing="ij")
-        columns.append(k.ravel()), rows.append(c.ravel()), values.append(part.ravel())
+        columns.append(k.ravel())
+        rows.append(c.ravel())
+        weights.append(part.ravel())
     mixing = scipy.sparse.csr_array(
-        (np.concatenate(values), (np.concatenate(rows), np.concatenate(columns))),
+        (np.concatenate(weights), (np.concatenate(rows), np.concatenate(columns))),
         shape=(shapes.shape[1], len(taken) * width),
     )
     if counted.nnz < _FILLED * np.prod(shapes.shape):

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from soma_core.errors import InputError
+from soma_core.geometry.constants import Kind
 from soma_core.geometry.kabsch import rotation_from_covariance
 from soma_core.geometry.rotations import axis_angle_to_matrix
 
@@ -223,10 +224,10 @@ def twist_doubt(
     if not rows:
         return None
     variable, axes, squares = zip(*rows, strict=True)
-    kind = {"dtype": dtype, "device": device}
+    kind: Kind = {"dtype": dtype, "device": device}
     return TwistDoubt(
         variable=torch.tensor(variable, dtype=torch.int64, device=device),
-        axis=torch.as_tensor(np.array(axes)).to(**kind),
+        axis=torch.as_tensor(np.array(axes), **kind),
         square=torch.tensor(squares, **kind),
     )
 
@@ -255,7 +256,7 @@ def joint_terms(
         hinges[_find(name, names, "hinges")] = np.asarray(axis) / length
     if not rows and not hinges.any():
         return None
-    kind = {"dtype": dtype, "device": device}
+    kind: Kind = {"dtype": dtype, "device": device}
     variable, strengths, free = zip(*rows, strict=True) if rows else ((), (), ())
     return JointTerms(
         variable=torch.tensor(variable, dtype=torch.int64, device=device),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -48,7 +49,7 @@ class Problem:
         """The problem of some of its frames."""
         count = len(self.vertices)
 
-        def own(value):
+        def own(value: Any) -> Any:
             return value[rows] if isinstance(value, Tensor) and len(value) == count > 1 else value
 
         rest, identity, terms = self.rest, part_of(self.identity, rows), self.terms

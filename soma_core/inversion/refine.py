@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -261,12 +262,13 @@ def _narrowed(solve: Callable[[Tensor], Tensor], rows: Tensor, count: int) -> Ca
 def _part(view: View, rows: Tensor) -> View:
     """The view of some frames."""
 
-    def own(value):
+    def own(value: Any) -> Any:
         if isinstance(value, Tensor):
             return value[rows]
         return None if value is None else type(value)(**{name: own(one) for name, one in vars(value).items()})
 
-    return own(view)
+    part: View = own(view)
+    return part
 
 
 def _chosen(better: Tensor, new: Tensor, old: Tensor) -> Tensor:
@@ -274,7 +276,7 @@ def _chosen(better: Tensor, new: Tensor, old: Tensor) -> Tensor:
 
 
 def _chosen_view(better: Tensor, new: View, old: View) -> View:
-    parts = {}
+    parts: dict[str, Any] = {}
     for name, value in vars(new).items():
         before = getattr(old, name)
         if isinstance(value, Tensor):

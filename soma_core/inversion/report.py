@@ -199,7 +199,7 @@ def _changes(shoulders: np.ndarray) -> dict[str, np.ndarray]:
     change = change[np.isfinite(change).any(axis=1)] if change.size else change[:0]
     if not len(change):
         return {"changes": np.zeros(2), "peaks": np.zeros(2)}
-    means = np.nanmean(change, axis=1, dtype=np.float64)
+    means = np.asarray(np.nanmean(change, axis=1, dtype=np.float64))
     return {
         "changes": np.array([len(means), means.sum()]),
         "peaks": np.array([means.max(), np.nanmax(change)], np.float64),

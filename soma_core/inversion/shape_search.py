@@ -150,8 +150,8 @@ def _starts(search: _Search, parameters: FreeParameters) -> list[np.ndarray]:
     """The given start, and the best of bodies spread over the bounded parameters."""
     spread = parameters.spread(_CANDIDATES)
     errors = [search.errors(spread[k : k + _AT_A_TIME]) for k in range(0, len(spread), _AT_A_TIME)]
-    order = np.argsort(np.concatenate(errors)) if errors else []
-    return [parameters.start, *(spread[index] for index in order[: _STARTS - 1])]
+    order = np.argsort(np.concatenate((np.zeros(0), *errors)))
+    return [parameters.start, *spread[order[: _STARTS - 1]]]
 
 
 class _Search:
@@ -216,7 +216,7 @@ class _Search:
     def _normal_equations(self, state: _State, trust: Tensor, prior: float) -> tuple[np.ndarray, np.ndarray]:
         steps = self.unknowns.inward(state.point, _STEP)
         points = state.point + np.concatenate((np.zeros((1, len(steps))), np.diag(steps)))
-        matrix, slope = shape_normal_equations(
+        left, right = shape_normal_equations(
             self.inversion,
             self.sample.vertices,
             self.sample.weights * trust,
@@ -225,7 +225,7 @@ class _Search:
             torch.as_tensor(steps, device=trust.device),
         )
         total = float(self.sample.weights.expand(len(self.sample.vertices), -1).double().sum())
-        matrix, slope = matrix.cpu().numpy() / total, slope.cpu().numpy() / total
+        matrix, slope = left.cpu().numpy() / total, right.cpu().numpy() / total
         return matrix + prior * np.eye(len(slope)), slope + prior * state.point
 
     def _stepped(

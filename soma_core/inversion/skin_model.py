@@ -5,13 +5,14 @@ from __future__ import annotations
 import functools
 from collections.abc import Callable
 from dataclasses import replace
-from typing import TYPE_CHECKING, TypedDict
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from soma_core.animation.engine import Animation
+from soma_core.geometry.constants import Kind, constant
 from soma_core.geometry.sparse import SparseRows
 from soma_core.inversion.curvature import SkinCurvature, in_float64
 from soma_core.inversion.driven import DrivenJoints
@@ -21,6 +22,7 @@ from soma_core.inversion.moments import RestMoments, SkinMoments
 from soma_core.inversion.offsets import PoseOffsets
 from soma_core.inversion.priors import TwistDoubt
 from soma_core.inversion.problem import Activity, Pose, Problem, View
+from soma_core.inversion.protocol import Curvature
 from soma_core.inversion.start import ProcrustesStart
 from soma_core.inversion.structure import MomentStructure
 from soma_core.inversion.tables import solver_tables
@@ -43,13 +45,6 @@ _INDEFINITE = 1e15
 """A variance [rad^2/m^2] that no ridge lets through: the factorisation met a pivot that is not positive."""
 
 
-class Kind(TypedDict):
-    """What constants are kept as."""
-
-    dtype: torch.dtype
-    device: torch.device | str
-
-
 class SkinModel(torch.nn.Module):
     """Skinning by the joints of one rig, and the solver of its poses.
 
@@ -66,8 +61,6 @@ class SkinModel(torch.nn.Module):
         moments, solver, start: of the rig; driven joints are joints of it.
         fitted: (v,) bool, vertices that take part by default.
     """
-
-    orient: Tensor
 
     def __init__(
         self,
@@ -95,7 +88,7 @@ class SkinModel(torch.nn.Module):
         self._steps = self._step_kernels() if self.solver.kernels is not None else None
         orient = rig.t_pose_world[:, :3, :3].copy()
         orient[0] = np.eye(3)
-        self.register_buffer("orient", torch.as_tensor(orient).to(**kind), persistent=False)
+        self.orient = constant(orient, **kind)
 
     @functools.cached_property
     def skin(self) -> SparseRows:
@@ -375,7 +368,7 @@ class SkinModel(torch.nn.Module):
             self.solver.add_terms(matrix, slope, pose.relative, turns, problem.terms, mass)
         return matrix
 
-    def curvature(self, problem: Problem, pose: Pose) -> SkinCurvature:
+    def curvature(self, problem: Problem, pose: Pose) -> Curvature:
         """The exact curvature of the error at poses."""
         return SkinCurvature(self, problem, pose)
 

@@ -6,6 +6,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from soma_core.geometry.constants import constant
 from soma_core.geometry.kabsch import rotation_from_covariance
 from soma_core.inversion.limbs import LimbStart
 from soma_core.inversion.moments import RestMoments
@@ -47,9 +48,8 @@ class ProcrustesStart(torch.nn.Module):
         for joint in range(1, len(parents)):
             if source[joint] == len(structure.joints):
                 source[joint] = source[parents[joint]]
-        self.register_buffer("parents", torch.as_tensor(parents, device=device), persistent=False)
-        self.register_buffer("source", torch.as_tensor(source, device=device), persistent=False)
-        self.register_buffer("eye", torch.eye(3, dtype=dtype, device=device), persistent=False)
+        self.parents, self.source = constant(parents, device=device), constant(source, device=device)
+        self.eye = constant(np.eye(3), device=device, dtype=dtype)
 
     def forward(self, target: Tensor, rest: RestMoments) -> Tensor:
         """T-pose-relative rotations (F, J, 3, 3) from ``R`` (F, T, 3, 4)."""

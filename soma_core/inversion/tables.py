@@ -134,7 +134,7 @@ class _Twists:
         for k in range(plan.driven):
             helper = int(plan.joint[k]) - self.first
             reached = [int(i) for i in plan.row_joint[plan.row_start[k] : plan.row_start[k + 1]]]
-            channels = np.flatnonzero(self.mix[helper])
+            channels = np.flatnonzero(self.mix[helper]).tolist()
             drives.append(
                 [(i, place[c, i], self.mix[helper, c]) for i in reached for c in channels if i in self.free]
             )
@@ -218,7 +218,7 @@ class _Modes:
 
     def _tree(self, clouds: Sequence[int]) -> list[int]:
         """Joints that the clouds hang on, children first, the root last."""
-        found = self.structure.ancestors[:, self.structure.joints[list(clouds)]].any(1) if clouds else []
+        found = self.structure.ancestors[:, self.structure.joints[list(clouds)]].any(1)
         return [int(i) for i in np.flatnonzero(found)[::-1]]
 
     def _rows(self, block: int) -> list[int]:

@@ -64,16 +64,13 @@ def is_linear(offsets: Callable[[Tensor], Tensor], shapes: Tensor) -> bool:
     return bool((found - told).abs().max() <= close)
 
 
-def blended_view(rig: PosedModel, problem: Problem, pose: Pose) -> View:
-    """Error of poses whose blend shapes are not linear, and its derivative by autograd."""
-    from soma_core.inversion.skin_model import SkinModel
-
+def blended_view(rig: PosedModel, problem: Problem, pose: Pose, view: View) -> View:
+    """A view with the error of poses whose blend shapes are not linear, and its derivative by autograd."""
     motion = torch.zeros_like(pose.relative[:, : len(rig.solver.variables) + 1, 0]).requires_grad_()
     turns, _ = rig.solver.walk(pose, problem.rest)
     with torch.enable_grad():
         energy = _energy(rig, problem, rig.solver.retract(pose, turns, motion))
         (slope,) = torch.autograd.grad(0.5 * energy.sum(), motion)
-    view = SkinModel.view(rig, problem, pose)
     return replace(view, energy=energy.detach().to(slope), slope=slope)
 
 

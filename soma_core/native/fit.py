@@ -92,9 +92,8 @@ class NativeFit(Derived):
 
     def _build(self, device: torch.device, dtype: torch.dtype) -> None:
         self.device, self.dtype = device, dtype
-        kind = {"device": device, "dtype": dtype}
         registry, backend = self._registry, self.backend
-        generator = registry.generator(backend, options=self.options, **kind)
+        generator = registry.generator(backend, options=self.options, device=device, dtype=dtype)
         if not isinstance(generator, HasSkinning):
             raise InputError(
                 "backend",
@@ -103,11 +102,11 @@ class NativeFit(Derived):
                 fix="NativeTransfer gives its vertices.",
             )
         self._generator, self._isolated = generator, lambda: registry.isolated(backend, "rest")
-        self.transfer = NativeTransfer(backend, lod=self.lod, registry=registry, **kind)
+        self.transfer = NativeTransfer(backend, lod=self.lod, registry=registry, device=device, dtype=dtype)
         self.spec, self.scale = self.transfer.spec, METRES[self.transfer.spec.unit]
         covered = self.transfer.covered.cpu().numpy()
         model = self._model(self._one_body({}))
-        self.rig = NativeRig(model, self.scale, covered, kernels=self.kernels, **kind)
+        self.rig = NativeRig(model, self.scale, covered, kernels=self.kernels, device=device, dtype=dtype)
         self.joint_names = self.rig.joint_names
 
     @own_precision
@@ -290,5 +289,5 @@ def _finite(body: NativeBody, target: Tensor, weights: Tensor) -> tuple[Tensor, 
 
 def _joined(parts: Sequence[NativeMotion]) -> NativeMotion:
     """One motion of consecutive chunks of frames."""
-    joined = {name: torch.cat([getattr(part, name) for part in parts]) for name in _PER_FRAME}
+    joined: dict[str, Any] = {name: torch.cat([getattr(part, name) for part in parts]) for name in _PER_FRAME}
     return replace(parts[0], **joined)

@@ -11,11 +11,12 @@ import torch
 from torch import Tensor
 
 from soma_core.animation.engine import Animation
+from soma_core.geometry.constants import Kind
 from soma_core.inversion.moments import RestMoments
 from soma_core.inversion.offsets import PoseOffsets
 from soma_core.inversion.problem import Pose, Problem, View
 from soma_core.inversion.protocol import Curvature
-from soma_core.inversion.skin_model import Kind, SkinModel
+from soma_core.inversion.skin_model import SkinModel
 from soma_core.inversion.structure import MomentStructure, skin_structure
 from soma_core.layer import Kernels
 from soma_core.native.blend import BlendedCurvature, blend_shapes, blended_view, is_linear
@@ -99,7 +100,7 @@ class NativeRig(SkinModel):
             linear = is_linear(blend, shapes / scale)
             offsets = _offsets(shapes, rig, structure, **kind)
         super().__init__(
-            rig, structure, Animation(rig, kernels=kernels, **kind), offsets=offsets,
+            rig, structure, Animation(rig, kernels=kernels, dtype=dtype, device=device), offsets=offsets,
             warp=kernels == "warp" or (kernels == "auto" and device.type == "cpu"), **kind,
         )  # fmt: skip
         self.joint_names, self.linear, self._scale, self._blend = rig.user_joint_names, linear, scale, blend
@@ -141,10 +142,11 @@ class NativeRig(SkinModel):
 
     def view(self, problem: Problem, pose: Pose, bound: Tensor | None = None) -> View:
         """Error of poses, and its exact derivative; see :class:`ForwardModel`."""
+        view = super().view(problem, pose, bound)
         if self.linear:
-            return super().view(problem, pose, bound)
+            return view
         assert bound is None
-        return blended_view(self, problem, pose)
+        return blended_view(self, problem, pose, view)
 
     def curvature(self, problem: Problem, pose: Pose) -> Curvature:
         """The exact curvature of the error at poses."""

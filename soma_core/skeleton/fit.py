@@ -7,6 +7,7 @@ import scipy.sparse
 import torch
 from torch import Tensor
 
+from soma_core.geometry.constants import constant
 from soma_core.geometry.sparse import SparseRows
 from soma_core.geometry.torch_func import untracked
 from soma_core.rig.mesh import CanonicalMesh
@@ -70,8 +71,7 @@ class SkeletonFit(torch.nn.Module):
         self.joint_count = rig.joint_count
         self.moments = SparseRows(self.matrix, dtype=dtype, device=device)
         self.rotations = RotationFit(rig, dtype=dtype, device=device, warp=warp)
-        bottom = torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=dtype, device=device)
-        self.register_buffer("bottom", bottom, persistent=False)
+        self.bottom = constant(np.array([0.0, 0.0, 0.0, 1.0]), device=device, dtype=dtype)
 
     def forward(self, vertices: Tensor) -> Tensor:
         """World transforms (B, J, 4, 4) [m] of the joints, from vertices (B, v, 3) [m]. Differentiable."""
