@@ -8,9 +8,10 @@ from dataclasses import FrozenInstanceError, replace
 
 import pytest
 
+from soma_core.choices import FitLod, Lod
 from soma_core.errors import AssetError, InputError
 from soma_core.motion import BackendChoice, ConvertOptions, IdentityChoice, InvertOptions
-from soma_core.options import FitLod, Lod, ModelOptions
+from soma_core.options import ModelOptions
 from soma_core.plugin.errors import BrokenBackendError
 
 

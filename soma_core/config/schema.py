@@ -8,25 +8,21 @@ from typing import Any
 from hydra.core.config_store import ConfigStore
 from omegaconf import MISSING, OmegaConf
 
-from soma_core.motion.options import ConvertOptions, InvertOptions
-from soma_core.motion.writers import WriteOptions, listed_writers
-from soma_core.options import (
-    BackendChoice,
+from soma_core.choices import (
     Contacts,
     FitLod,
-    FrameRange,
     Gallery,
     Ground,
     IdentitySource,
     Kernels,
     LengthUnit,
-    ModelOptions,
-    Options,
-    Picture,
     Product,
     Translation,
     ViewOptions,
 )
+from soma_core.motion.options import ConvertOptions, InvertOptions
+from soma_core.motion.writers import WriteOptions, listed_writers
+from soma_core.options import BackendChoice, FrameRange, ModelOptions, Options, Picture
 
 __all__ = [
     "SCHEMAS",

@@ -10,6 +10,8 @@ from typing import TYPE_CHECKING
 from soma_core._lazy import lazy_names
 
 if TYPE_CHECKING:
+    from soma_core.io.bvh import read_bvh, write_bvh
+    from soma_core.io.skeleton_motion import SkeletonMotion
     from soma_core.motion.animated import Animated, animate
     from soma_core.motion.conversion import (
         FolderConverted,
@@ -26,6 +28,7 @@ if TYPE_CHECKING:
     from soma_core.motion.options import ConvertOptions, FitOptions, InvertOptions
     from soma_core.motion.played import Played
     from soma_core.motion.products import write_body, write_products
+    from soma_core.motion.retarget import retarget
     from soma_core.motion.writers import WriteOptions
     from soma_core.options import BackendChoice, FrameRange, IdentityChoice, InversionChoice, Picture
 
@@ -43,6 +46,7 @@ __all__ = [
     "InvertOptions",
     "Picture",
     "Played",
+    "SkeletonMotion",
     "WriteOptions",
     "animate",
     "convert",
@@ -56,13 +60,18 @@ __all__ = [
     "load_clip",
     "plan_fit",
     "read",
+    "read_bvh",
+    "retarget",
     "stored_identity",
     "write",
     "write_body",
+    "write_bvh",
     "write_products",
 ]
 
 _HOMES = {
+    "soma_core.io.bvh": ["read_bvh", "write_bvh"],
+    "soma_core.io.skeleton_motion": ["SkeletonMotion"],
     "soma_core.motion.animated": ["Animated", "animate"],
     "soma_core.motion.conversion": [
         "FolderConverted",
@@ -79,6 +88,7 @@ _HOMES = {
     "soma_core.motion.options": ["ConvertOptions", "FitOptions", "InvertOptions"],
     "soma_core.motion.played": ["Played"],
     "soma_core.motion.products": ["write_body", "write_products"],
+    "soma_core.motion.retarget": ["retarget"],
     "soma_core.motion.writers": ["WriteOptions"],
     "soma_core.options": ["BackendChoice", "FrameRange", "IdentityChoice", "InversionChoice", "Picture"],
 }

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 
+from soma_core.choices import Contacts, Ground, Translation
 from soma_core.errors import InputError
 from soma_core.io.motion import Motion
 from soma_core.io.motion_files import check_rig
@@ -26,7 +27,6 @@ from soma_core.motion.ground import (
     standing,
 )
 from soma_core.motion.identities import kept_identity
-from soma_core.options import Contacts, Ground, Translation
 from soma_core.progress import progress
 
 if TYPE_CHECKING:

@@ -12,6 +12,7 @@ from typing import Any
 import torch
 
 from soma_core.cache import atomic_text
+from soma_core.choices import Product, SmplLayout
 from soma_core.errors import InputError
 from soma_core.io.amass import SMPL_JOINTS
 from soma_core.json_file import read_json
@@ -25,7 +26,6 @@ from soma_core.motion.options import ConvertOptions
 from soma_core.motion.played import MovingBodies, Played, placing_of
 from soma_core.motion.questions import heard, of_motion, of_params, say
 from soma_core.native import NativeFit, NativeTransfer, ParameterFit
-from soma_core.options import Product, SmplLayout
 from soma_core.plugin.registry import default_registry
 from soma_core.progress import progress
 

@@ -19,7 +19,6 @@ from soma_core.motion.bodies import SMPL_LAYOUTS, smpl_choices
 from soma_core.motion.foot_lock import Limb
 from soma_core.motion.options import ConvertOptions
 from soma_core.motion.retarget import Retargeted, retarget
-from soma_core.options import BoneMatch
 from soma_core.rig import load_canonical
 from soma_core.rig.skeleton import Rig
 

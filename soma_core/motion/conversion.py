@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from soma_core.cache import atomic_text
+from soma_core.choices import FitLod, LengthUnit
 from soma_core.errors import InputError, SomaError
 from soma_core.io.motion import Motion
 from soma_core.io.motion_files import samples_of
@@ -25,7 +26,7 @@ from soma_core.motion.files import SUFFIXES, ResultFiles, layout_of, no_motion, 
 from soma_core.motion.options import ConvertOptions
 from soma_core.motion.poses import POSES, named_pose
 from soma_core.motion.questions import Names, of_motion, say
-from soma_core.options import FitLod, FrameRange, LengthUnit, ModelOptions, Picture
+from soma_core.options import FrameRange, ModelOptions, Picture
 from soma_core.paths import expanded
 from soma_core.rig.manifest import shipped_file
 

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
+from soma_core.choices import LengthUnit, Product
 from soma_core.errors import InputError
 from soma_core.io.data_files import DATA_SUFFIXES, open_data
 from soma_core.io.gem_x import gem_x_parts, gem_x_result
@@ -19,7 +20,6 @@ from soma_core.io.skeleton_files import SKELETON_SUFFIXES
 from soma_core.io.smpl_bodies import shown_names
 from soma_core.io.smpl_files import smpl_layout
 from soma_core.motion.writers import WRITERS
-from soma_core.options import LengthUnit, Product
 from soma_core.paths import expanded
 from soma_core.rig import load_canonical
 from soma_core.topology.frames import METRES

@@ -14,6 +14,7 @@ import numpy as np
 import torch
 
 from soma_core.cache import atomic_text, atomic_write
+from soma_core.choices import Upward
 from soma_core.errors import InputError, SomaError
 from soma_core.inversion.diagnosis import Diagnosis, diagnose_fit
 from soma_core.io.motion_files import write_motion_parts
@@ -26,7 +27,6 @@ from soma_core.motion.identities import found_identity, stored_identity
 from soma_core.motion.models import model_settings
 from soma_core.motion.options import FitOptions
 from soma_core.motion.questions import heard, of_path, say
-from soma_core.options import Upward
 from soma_core.progress import progress
 
 if TYPE_CHECKING:

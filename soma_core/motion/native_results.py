@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from soma_core.cache import atomic_arrays
+from soma_core.choices import Product
 from soma_core.io.amass import Gender, SmplMotion, SmplName, write_amass, write_smplx
 from soma_core.io.vertex_sequence import UpAxis
 from soma_core.io.vertex_writers import MeshFrames
@@ -24,7 +25,6 @@ from soma_core.motion.played import Played
 from soma_core.motion.posed_input import world_axes
 from soma_core.motion.writers import WRITERS
 from soma_core.native import NativeFit, NativeTransfer, ParameterFit
-from soma_core.options import Product
 from soma_core.topology.frames import METRES
 
 __all__ = ["NativeTarget", "ParameterTarget", "SmplTarget", "VertexTarget"]

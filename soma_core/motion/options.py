@@ -5,13 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, cast
 
-from soma_core.errors import InputError
-from soma_core.io.vertex_sequence import UpAxis
-from soma_core.motion.writers import MESH_WRITERS, WriteOptions
-from soma_core.options import (
+from soma_core.choices import (
     AngleUnit,
     Axes,
-    BackendChoice,
     BetasFrom,
     BodyGender,
     BoneMatch,
@@ -22,12 +18,7 @@ from soma_core.options import (
     FitLod,
     Gaps,
     Ground,
-    IdentityChoice,
-    InversionChoice,
     LengthUnit,
-    ModelOptions,
-    Options,
-    Picture,
     Product,
     Refine,
     RotationLayout,
@@ -38,6 +29,10 @@ from soma_core.options import (
     Translation,
     Upward,
 )
+from soma_core.errors import InputError
+from soma_core.io.vertex_sequence import UpAxis
+from soma_core.motion.writers import MESH_WRITERS, WriteOptions
+from soma_core.options import BackendChoice, IdentityChoice, InversionChoice, ModelOptions, Options, Picture
 from soma_core.topology.frames import METRES
 
 if TYPE_CHECKING:

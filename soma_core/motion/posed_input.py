@@ -6,9 +6,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from soma_core.choices import Topology
 from soma_core.errors import InputError
 from soma_core.io.vertex_sequence import UpAxis, VertexSequence
-from soma_core.options import Topology
 from soma_core.rig import load_canonical
 from soma_core.topology.correspondence import load_correspondence
 from soma_core.topology.frames import METRES, native_to_canonical

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from soma_core.cache import atomic_text
+from soma_core.choices import Product
 from soma_core.io.bvh import write_bvh
 from soma_core.io.camera import Camera, read_camera
 from soma_core.io.motion import Motion
@@ -21,7 +22,7 @@ from soma_core.motion.models import model_settings
 from soma_core.motion.options import ConvertOptions
 from soma_core.motion.played import MovingBodies, Played, placing_of
 from soma_core.motion.writers import WRITERS, WriteOptions
-from soma_core.options import BvhChoice, Picture, Product, VideoChoice
+from soma_core.options import BvhChoice, Picture, VideoChoice
 from soma_core.skeleton.identity import Identity
 from soma_core.view.picture import backend_colour, contact_sheet
 from soma_core.view.stage import Body

@@ -11,8 +11,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
+from soma_core.choices import Product, Upward
 from soma_core.errors import InputError
-from soma_core.options import BvhChoice, Options, Product, Upward, VideoChoice
+from soma_core.options import BvhChoice, Options, VideoChoice
 
 __all__ = ["MESH_WRITERS", "WRITERS", "WriteOptions", "Writer", "listed_writers"]
 

@@ -16,12 +16,12 @@ from typing import Any
 import numpy as np
 
 from soma_core.cache import atomic_write
+from soma_core.choices import Product, Translation
 from soma_core.errors import InputError, SomaError
 from soma_core.io.joint_order import USER_JOINTS
 from soma_core.motion.poses import POSES, named_pose
 from soma_core.motion.questions import heard
 from soma_core.motion.writers import WRITERS
-from soma_core.options import Product, Translation
 from soma_core.plugin.registry import default_registry
 from soma_core.viewer.scene import Scene, Switches
 from soma_core.viewer.session import Figure, Session

@@ -12,6 +12,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from soma_core.animation.kinematics import relative_from_absolute
+from soma_core.choices import Lod, Product, Translation
 from soma_core.errors import InputError
 from soma_core.geometry.rotations import axis_angle_to_matrix
 from soma_core.io.joint_order import USER_JOINTS
@@ -26,7 +27,7 @@ from soma_core.motion.options import ConvertOptions
 from soma_core.motion.played import Played
 from soma_core.motion.poses import named_pose
 from soma_core.motion.products import write_products
-from soma_core.options import Lod, Product, Translation, ViewOptions
+from soma_core.options import ViewOptions
 from soma_core.rig import load_canonical
 from soma_core.shape_space.sampling import sample_parameters
 from soma_core.skeleton.identity import Identity

@@ -11,6 +11,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from soma_core import SomaLayer
+from soma_core.choices import Product
 from soma_core.cli import EXIT_OK, EXIT_USAGE, main
 from soma_core.errors import AssetError, InputError
 from soma_core.io import open_vertex_sequence, write_motion
@@ -24,7 +25,7 @@ from soma_core.motion import (
     write_products,
 )
 from soma_core.motion.writers import MESH_WRITERS, WRITERS, listed_writers
-from soma_core.options import BvhChoice, FrameRange, Product
+from soma_core.options import BvhChoice, FrameRange
 
 ROUNDING = 1e-6
 """Metres: float32 at the size of a body."""

@@ -8,13 +8,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from soma_core.choices import Product
 from soma_core.errors import InputError, SomaError
 from soma_core.layer import SomaLayer
 from soma_core.motion import load_clip
 from soma_core.motion.played import Played
 from soma_core.motion.products import write_products
 from soma_core.motion.writers import WRITERS, WriteOptions
-from soma_core.options import FrameRange, Product, VideoChoice
+from soma_core.options import FrameRange, VideoChoice
 from soma_core.view.video import write_video
 
 SIZE = 64

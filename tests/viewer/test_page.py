@@ -13,11 +13,12 @@ import time
 import numpy as np
 import pytest
 
+from soma_core.choices import Lod, Product
 from soma_core.errors import InputError, SomaError
 from soma_core.io import read_motion
 from soma_core.io.joint_order import USER_JOINTS
 from soma_core.motion.poses import named_pose
-from soma_core.options import Lod, Product, ViewOptions
+from soma_core.options import ViewOptions
 from soma_core.plugin.registry import default_registry
 from soma_core.viewer.page import Page
 from soma_core.viewer.server import close, open_server

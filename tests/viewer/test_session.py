@@ -5,12 +5,13 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
+from soma_core.choices import Lod, Product
 from soma_core.errors import InputError
 from soma_core.io.joint_order import USER_JOINTS
 from soma_core.motion import load_clip, write
 from soma_core.motion.options import ConvertOptions
 from soma_core.motion.poses import POSES, named_pose
-from soma_core.options import FrameRange, Lod, Product, ViewOptions
+from soma_core.options import FrameRange, ViewOptions
 from soma_core.viewer.session import Session
 from soma_core.viewer.sources import settings_of
 
