@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, get_args
+from typing import TYPE_CHECKING, Any, Literal, cast, get_args
 
 import torch
 from torch import Tensor
@@ -277,16 +277,12 @@ class SomaLayer(PartialBodies):
         of the vertices is what twist joints and correctives add.
         """
         body = self._body(identity, rotations, translation, bone_scale)
+        plain, scale = self.animation, body.bone_scale
         if self._fusible(*body[:4]):
             assert self.fused is not None
-            posed: Posed = self.fused(
-                *body[:3], absolute=absolute, bone_scale=body.bone_scale, plain=self.animation
-            )
-            return posed
+            return cast(Posed, self.fused(*body[:3], absolute=absolute, bone_scale=scale, plain=plain))
         turns = as_matrices(body.relative)
-        return self.animation.pose(
-            body.identity, turns, body.translation, absolute=absolute, bone_scale=body.bone_scale
-        )
+        return plain.pose(identity, turns, body.translation, absolute=absolute, bone_scale=scale)
 
     def _fusible(
         self, identity: Identity, relative: Tensor, translation: Tensor, bone_scale: Tensor | None
