@@ -141,10 +141,6 @@ class Animation(torch.nn.Module):
             transforms=to_homogeneous(rotations, positions),
         )
 
-    def pose_body(self, body: Body) -> Posed:
-        """:meth:`pose` of arguments in one, T-pose-relative."""
-        return self.pose(*body[:3], absolute=False, bone_scale=body.bone_scale, offsets=body.offsets)
-
     def transforms(self, body: Body, *, absolute: bool) -> Tensor:
         """World transforms of the joints alone (B, J, 4, 4) [m], without the mesh."""
         return to_homogeneous(*self._walk(*body[:4], absolute=absolute))

@@ -12,13 +12,12 @@ import numpy as np
 
 from soma_core.cache import atomic_arrays
 from soma_core.errors import InputError
-from soma_core.shape_space.mirror import mirror_shapes
 from soma_core.shape_space.sampling import TRAINING, IdentityStream
 
 if TYPE_CHECKING:
     from sklearn.decomposition import IncrementalPCA
 
-__all__ = ["Components", "TrainingPlan", "train_components"]
+__all__ = ["Components", "TrainingPlan", "mirror_shapes", "train_components"]
 
 _log = logging.getLogger(__name__)
 
@@ -169,3 +168,15 @@ def _fitted_values(saved: Mapping[str, np.ndarray]) -> Iterator[tuple[str, objec
     for name in _FITTED:
         value = saved[name]
         yield name, value if value.ndim else value.item()
+
+
+def mirror_shapes(shapes: np.ndarray, bind: np.ndarray, partner: np.ndarray) -> np.ndarray:
+    """Mirror shapes (batch, v, 3) in the plane x = 0, vertex ids included.
+
+    The canonical mesh is not exactly symmetric, so the deviation from `bind` (v, 3) is mirrored rather
+    than the positions: the bind shape is its own mirror image. `partner` (v,) holds each vertex's
+    counterpart on the other side. All lengths in one unit.
+    """
+    deviation = (shapes - bind)[:, partner]
+    deviation[..., 0] *= -1
+    return bind + deviation

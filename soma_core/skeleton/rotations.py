@@ -15,7 +15,7 @@ from soma_core.geometry.rotations import shortest_arc
 from soma_core.geometry.torch_func import transformed
 from soma_core.rig.skeleton import Rig
 
-__all__ = ["AlignmentPlan", "alignment_plan", "fit_rotations"]
+__all__ = ["AlignmentPlan", "RotationFit", "alignment_plan"]
 
 _SHORTEST_BONE = 1e-8
 """Bones shorter than this fraction of body height do not turn their joint."""
@@ -59,7 +59,16 @@ def alignment_plan(rig: Rig) -> AlignmentPlan:
 
 
 class RotationFit(torch.nn.Module):
-    """Stage 2 for all joints at once, on constant index lists; see :func:`fit_rotations`.
+    """World rotations of all joints; (B, J, 3), (B, J, 3, 3) -> (B, J, 3, 3).
+
+    Stage a: ``R_init`` is the rotation nearest to the covariance ``sum (x - j)(a - j_bind)^T`` of the
+    joint's vertices. Stage b: one child, the shortest arc from the turned bind bone to the fitted one;
+    several children, the rotation nearest to the covariance of their bones and of the normals of each
+    pair of bones; none, the displacement of the parent.
+    A fan of children is nearly flat (hips, chest, hand): its bones alone leave the tilt of that plane
+    to their smallest deviations. The pairs' normals hold it, whatever the order of the children.
+    The world rotation is ``R_align R_init R_bind``. Differentiable; every joint independent of the
+    others, so a posed body is fitted as well as a body at rest.
 
     Args:
         rig: joints and bind pose.
@@ -156,18 +165,3 @@ class RotationFit(torch.nn.Module):
         """Bones turned by stage a, and fitted bones, from the pivots at `rank` to `child`."""
         turned = (initial[:, rank] @ bones[:, child, :, None]).squeeze(-1)
         return turned, joints[:, child] - joints[:, self.pivots[rank]]
-
-
-def fit_rotations(rig: Rig, joints: Tensor, covariances: Tensor) -> Tensor:
-    """World rotations of all joints; (B, J, 3), (B, J, 3, 3) -> (B, J, 3, 3).
-
-    Stage a: ``R_init`` is the rotation nearest to the covariance ``sum (x - j)(a - j_bind)^T`` of the
-    joint's vertices. Stage b: one child, the shortest arc from the turned bind bone to the fitted one;
-    several children, the rotation nearest to the covariance of their bones and of the normals of each
-    pair of bones; none, the displacement of the parent.
-    A fan of children is nearly flat (hips, chest, hand): its bones alone leave the tilt of that plane
-    to their smallest deviations. The pairs' normals hold it, whatever the order of the children.
-    The world rotation is ``R_align R_init R_bind``. Differentiable; every joint independent of the
-    others, so a posed body is fitted as well as a body at rest.
-    """
-    return RotationFit(rig, dtype=joints.dtype, device=joints.device)(joints, covariances)

@@ -7,9 +7,8 @@ import pytest
 
 from soma_core.errors import InputError
 from soma_core.rig import load_canonical
-from soma_core.shape_space.mirror import mirror_shapes
 from soma_core.shape_space.report import plot_errors, reconstruction_errors
-from soma_core.shape_space.training import TrainingPlan, train_components
+from soma_core.shape_space.training import TrainingPlan, mirror_shapes, train_components
 
 VERTICES = 30
 RANK = 6

@@ -11,7 +11,7 @@ from soma_core.geometry.kabsch import PRIOR_STRENGTH
 from soma_core.geometry.rotations import axis_angle_to_matrix, orthonormality_error
 from soma_core.rig import load_canonical
 from soma_core.skeleton.fit import SkeletonFit
-from soma_core.skeleton.rotations import alignment_plan, fit_rotations
+from soma_core.skeleton.rotations import alignment_plan
 from tests.bodies import CPU, randn, tiny_canonical
 
 ROUNDING = 1e-9
@@ -242,14 +242,6 @@ def test_vertices_of_the_face_interior_are_not_read(fit):
     spoilt = body.clone()
     spoilt[:, torch.as_tensor(MESH.face_interior.astype(np.int64))] += 5
     torch.testing.assert_close(fit(spoilt), fit(body))
-
-
-def test_fit_rotations_is_the_same_function(fit):
-    moments = fit.moments(lumps(MESH.vertices, 2).permute(1, 2, 0).reshape(MESH.vertex_count, 6))
-    moments = moments.view(RIG.joint_count, 4, 3, 2).permute(3, 0, 1, 2)
-    joints, covariances = moments[:, :, 0], moments[:, :, 1:].transpose(-1, -2)
-    expected = fit.from_moments(moments)[..., :3, :3]
-    torch.testing.assert_close(fit_rotations(RIG, joints, covariances), expected)
 
 
 def test_plan_names_every_joint_once():
