@@ -35,7 +35,7 @@ class Derived(torch.nn.Module):
     def __init__(self, given: Mapping[str, Any], device: torch.device | str, dtype: torch.dtype) -> None:
         super().__init__()
         check_choice("dtype", dtype, _DTYPES)
-        self._given = {
+        self._given: dict[str, Any] = {
             name: dict(value) if isinstance(value, Mapping) else value
             for name, value in given.items()
             if name not in ("self", "__class__")
@@ -76,7 +76,7 @@ class Derived(torch.nn.Module):
 
     def __reduce__(self) -> tuple[Any, ...]:
         kind = {"device": self.device, "dtype": self.dtype}
-        given: dict[str, Any] = self._given | {key: one for key, one in kind.items() if key in self._given}
+        given = self._given | {key: one for key, one in kind.items() if key in self._given}
         # copy.deepcopy copies these, which come first, and shares what the function holds, such as meshes.
         modules = {name: value for name, value in given.items() if isinstance(value, torch.nn.Module)}
         rest = {name: value for name, value in given.items() if name not in modules}

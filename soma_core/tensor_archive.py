@@ -117,7 +117,7 @@ class _Contents:
             raise ValueError("is not what torch.save writes: no data.pkl, or several")
         self._root = pickles[0].removesuffix("data.pkl")
         order = f"{self._root}byteorder"
-        self._order = ">" if order in self._members and self._member(order, most=6) == b"big" else "<"
+        self._big = order in self._members and self._member(order, most=6) == b"big"
 
     def _refuse_strange_members(self, size: int) -> None:
         if len(self._members) != len(self._archive.infolist()):
@@ -200,7 +200,7 @@ class _Contents:
         name = kind.name.removesuffix("Storage")
         if name not in _DTYPES:
             raise ValueError(f"a storage of {kind}, which is not read here")
-        dtype = np.dtype(_DTYPES[name]).newbyteorder(self._order)
+        dtype = np.dtype(_DTYPES[name]).newbyteorder(">" if self._big else "<")
         member = f"{self._root}data/{key}"
         data = self._member(member, most=_MOST_BYTES)
         if len(data) != count * dtype.itemsize:

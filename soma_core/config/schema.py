@@ -18,11 +18,10 @@ from soma_core.choices import (
     LengthUnit,
     Product,
     Translation,
-    ViewOptions,
 )
 from soma_core.motion.options import ConvertOptions, InvertOptions
 from soma_core.motion.writers import WriteOptions, listed_writers
-from soma_core.options import BackendChoice, FrameRange, ModelOptions, Options, Picture
+from soma_core.options import BackendChoice, FrameRange, ModelOptions, Options, Picture, ViewOptions
 
 __all__ = [
     "SCHEMAS",
