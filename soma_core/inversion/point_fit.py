@@ -262,4 +262,5 @@ class PointFit:
             residual=residual.masked_fill(~valid, torch.nan),
             angle_std=std.masked_fill(~valid[:, None], torch.nan),
             noise=self.noise,
+            plain=torch.zeros_like(valid),
         )
