@@ -21,6 +21,12 @@ def _plain_environment(monkeypatch: pytest.MonkeyPatch) -> None:
             monkeypatch.delenv(name)
 
 
+@pytest.fixture(params=[True, pytest.param(False, marks=pytest.mark.slow)], ids=["fast", "full"])
+def fast_mode(request: pytest.FixtureRequest) -> bool:
+    """For ``torch.autograd.gradcheck``: the Jacobian in a random direction, or, slowly, every entry of it."""
+    return bool(request.param)
+
+
 @pytest.fixture
 def site(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     """A site-packages folder at the head of the path; what is imported from it is forgotten again."""

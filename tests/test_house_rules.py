@@ -317,6 +317,7 @@ def test_importing_loads_nothing_heavy(statement: str) -> None:
     assert not loaded & HEAVY
 
 
+@pytest.mark.slow
 def test_torch_kernels_import_no_warp() -> None:
     script = (
         "import sys; sys.modules['warp'] = None\n"

@@ -573,6 +573,7 @@ def fresh_compiler():
     torch._dynamo.reset()
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::DeprecationWarning:torch")
 @pytest.mark.parametrize("form", ["axis-angle", "matrices"])
 @pytest.mark.parametrize("kernels", ["torch", "warp"])

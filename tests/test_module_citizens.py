@@ -127,7 +127,7 @@ class Clips(Dataset):
             return vertices, self.bodies[index].fit(vertices, identity).rotations
 
 
-@pytest.mark.parametrize("start", ["fork", "spawn"])
+@pytest.mark.parametrize("start", ["fork", pytest.param("spawn", marks=pytest.mark.slow)])
 def test_workers_give_the_same_bits(start):
     clips, threads = Clips(), torch.get_num_threads()
     torch.set_num_threads(1)  # as in a worker
@@ -198,6 +198,7 @@ def test_autocast_changes_nothing(bodies, single):
     assert_same((*results, *torch.autograd.grad(loss, tracked)), single)
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::DeprecationWarning:torch")
 def test_compiles_in_one_graph_under_autocast(bodies):
     torch._dynamo.reset()

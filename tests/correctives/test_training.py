@@ -161,6 +161,7 @@ with joined_processes("cpu") as processes:
 """
 
 
+@pytest.mark.slow
 def test_two_processes_train_like_one(trainer, lessons, tmp_path):
     alone = _run(trainer(epochs=2), tmp_path / "alone.pt").network.first.detach()
     store, _ = lessons

@@ -83,6 +83,7 @@ def test_smooth_motions_are_smooth_and_end_where_they_begin():
     np.testing.assert_array_equal(turns, again)
 
 
+@pytest.mark.slow
 def test_table2_lays_the_papers_rows_and_both_layers_side_by_side(small):
     report = table2_inversion.run(configured())
     assert not [figure for figure in report.failed if figure.name.startswith("plain, own meshes")]
@@ -100,12 +101,14 @@ def test_table2_lays_the_papers_rows_and_both_layers_side_by_side(small):
     assert json.loads(json.dumps(report.as_json()))["tables"][0]["rows"][1][:3] == ["analytical", 5.3, 3.2]
 
 
+@pytest.mark.slow
 def test_the_default_rows_fit_what_the_default_posed(small):
     report = table2_inversion.run(configured())
     through, ignoring = (row[2] for row in report.tables[1].rows[:2])
     assert through < ignoring, "a fit that ignores twist joints and correctives misses what posed the mesh"
 
 
+@pytest.mark.slow
 def test_table2_fails_where_the_default_misses_its_bound(small, mesh, twisted, monkeypatch):
     noise = 0.01 * torch.randn(mesh.vertices.shape, generator=torch.Generator().manual_seed(0))
     noisy = [replace(one, vertices=one.vertices + noise) for one in (mesh, twisted)]

@@ -214,6 +214,7 @@ def test_annys_own_rig_through_plain_skinning(monkeypatch):
     assert len(hinges.table.rows) == len(HINGES)
 
 
+@pytest.mark.slow
 def test_the_report_lays_both_layers_side_by_side(monkeypatch):
     monkeypatch.setattr(pose_angles, "PIECES", {"gradients": pose_angle_noise.gradients})
     monkeypatch.setattr(pose_angle_noise, "_GRADIENT_FRAMES", 1)

@@ -65,6 +65,7 @@ def person(tmp_path) -> Path:
     return tmp_path
 
 
+@pytest.mark.slow
 def test_a_person_is_found_and_shown(person, monkeypatch, low):
     body = mhr_body(1)
     wrap = Wrap(

@@ -7,8 +7,16 @@ VALUES_M = {torch.float32: 1e-5, torch.float64: 1e-10}
 """The promised bound on positions; float64 leaves room for ill-conditioned rotations only."""
 GRADIENTS = {torch.float32: 1e-4, torch.float64: 1e-8}
 """The promised bound, relative to the largest gradient of an input."""
-BATCHES = [1, 2, 7, 33]
-DTYPES = [torch.float32, torch.float64]
+
+
+def quick(*values, slow):
+    """Cases of a parametrised test, of which some run only where the slow tests do."""
+    slow = [value if isinstance(value, tuple) else (value,) for value in slow]
+    return [*values, *(pytest.param(*value, marks=pytest.mark.slow) for value in slow)]
+
+
+BATCHES = quick(1, 7, slow=[2, 33])
+DTYPES = quick(torch.float32, slow=[torch.float64])
 DEVICES = [
     "cpu",
     pytest.param("cuda", marks=pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")),

@@ -12,7 +12,7 @@ from soma_core.kernels._patch_text import PATCH_VERTICES
 from soma_core.kernels.model_residual import ModelResidual
 from soma_core.kernels.residual_patches import ResidualPatches
 from tests.bodies import randn
-from tests.kernels.parity import DEVICES, DTYPES
+from tests.kernels.parity import DEVICES, DTYPES, quick
 from tests.kernels.test_model_residual_wp import (
     ACTIVATIONS,
     JOINTS,
@@ -25,7 +25,7 @@ from tests.kernels.test_model_residual_wp import (
     model,
 )
 
-BATCHES = [1, 7, 9, 33]
+BATCHES = quick(1, 9, slow=[7, 33])
 """Frames by themselves, and in groups of which the last is not full."""
 
 

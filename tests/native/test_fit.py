@@ -33,6 +33,7 @@ def posed(fit, motion):
     return fit._generator.posed(motion.params, pose)
 
 
+@pytest.mark.slow
 def test_parameters_give_the_vertices_under_the_model_itself(fit, motion):
     torch.testing.assert_close(posed(fit, motion), motion.vertices, atol=2e-6, rtol=0)
     target = fit.transfer
@@ -134,6 +135,7 @@ def test_refusals(fit, vertices):
         fit(vertices, weights=torch.ones(7))
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("data")
 def test_it_is_a_module_like_any_other(fit, vertices):
     """Pickled, converted, in a cast network and under autocast: the same bits as one made so."""
@@ -153,6 +155,7 @@ def test_it_is_a_module_like_any_other(fit, vertices):
         torch.func.vmap(fit)(given[None])
 
 
+@pytest.mark.slow
 def test_gradients_reach_the_canonical_vertices(fit, vertices, motion):
     tracked = vertices[:1].clone().requires_grad_()
     found = fit(tracked, params=motion.params)
