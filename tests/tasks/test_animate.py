@@ -50,6 +50,7 @@ def lowest(result):
     return min(vertices[:, 1].min() for vertices in result.vertices.values())
 
 
+@pytest.mark.slow
 def test_run_writes_what_is_asked_for(tmp_path):
     task.run(configured(write=["npz", "usd", "glb"]), tmp_path)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["body.glb", "body.usdc", "motion.npz"]
@@ -181,6 +182,7 @@ def test_the_extra_low_mesh_is_written_with_its_own_faces_and_texture(tmp_path):
     assert read_motion(tmp_path / "motion.npz").rig_revision.endswith("-xlo")
 
 
+@pytest.mark.slow
 def test_the_options_of_a_backend_are_kept(smplh_models, tmp_path):
     """The stand-in is female only: without its options the motion would play as a body that is not there."""
     female = {"params": {"betas": [1.0, 0, 0]}, "options": {"gender": "female"}}

@@ -54,6 +54,7 @@ def test_every_finding_is_listed(copied):
         assert text in str(caught.value)
 
 
+@pytest.mark.slow
 def test_a_missing_key_is_found_behind_a_right_hash(copied):
     with np.load(copied / NEUTRAL_NAME) as file:
         kept = {name: file[name] for name in file.files if name not in ("triangles_low", "mean")}

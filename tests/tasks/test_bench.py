@@ -15,6 +15,7 @@ def configured(**changes):
     return OmegaConf.merge(OmegaConf.structured(BenchConfig), settings | changes)
 
 
+@pytest.mark.slow
 def test_every_case_is_written(tmp_path):
     bench.run(configured(), tmp_path)
     document = json.loads((tmp_path / "bench.json").read_text(encoding="utf-8"))

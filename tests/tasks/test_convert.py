@@ -42,6 +42,7 @@ def files_of(folder):
     return sorted(path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file())
 
 
+@pytest.mark.slow
 def test_a_folder_is_mirrored(smplh_models, folder, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     command = ["convert", "input=in", "out=made", "lod=low", "picture.frames=0"]

@@ -107,6 +107,7 @@ def test_the_report_says_what_was_fitted_and_how_well(source, tmp_path):
         assert 1e3 * frames["mean_error"].mean() == pytest.approx(found["mean"], rel=1e-5)
 
 
+@pytest.mark.slow
 def test_twist_and_correctives_are_fitted_unless_told_otherwise(layer, source, tmp_path):
     """To a body of plain skinning, the full model comes near; the report says which model it is about.
 
@@ -296,6 +297,7 @@ def test_from_the_command_line(source, tmp_path, monkeypatch, capsys):
     assert "8 frames, 0 of them unusable; converged 100.0%" in streams.err
 
 
+@pytest.mark.slow
 def test_a_prior_on_neighbours_sees_across_chunks(layer, source, tmp_path):
     smooth = {"inversion": {"priors": {"temporal_strength": 0.05}}}
     invert.run(configured(input=str(source), **smooth), tmp_path / "whole")
@@ -306,6 +308,7 @@ def test_a_prior_on_neighbours_sees_across_chunks(layer, source, tmp_path):
     assert np.abs(whole - free).max() > 100 * CHUNK_TOLERANCE
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", ["transfer", "analytical", "autograd", "analytical_autograd"])
 def test_the_papers_methods_run_from_the_command_line(source, tmp_path, monkeypatch, capsys, method):
     monkeypatch.chdir(tmp_path)
