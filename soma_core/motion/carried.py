@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
+from soma_core.choices import BoneMatch
 from soma_core.io.joint_names import read_mapping
 from soma_core.io.motion import Motion
 from soma_core.io.skeleton_files import read_skeleton
