@@ -31,6 +31,7 @@ __all__ = ["run"]
 def _scale_errors(layer: SomaLayer, params: dict[str, Tensor]) -> list[Figure]:
     """Scale the native mesh and compare the transfers, bags included and filled."""
     spec, mesh = layer.spec, layer.mesh
+    assert spec.wrap is not None
     correspondence = load_correspondence(spec.wrap, mesh)
     generator = default_registry().generator(layer.backend, device=layer.device, dtype=layer.dtype)
     native = generator.rest(batch_parameters(spec, params, device=layer.device, dtype=layer.dtype))

@@ -87,23 +87,30 @@ def _files(data: str | None) -> list[Path]:
 
 def _clips(files: list[Path], layer: SomaLayer) -> Iterator[_Clip]:
     """Each file; contacts that it does not tell are found on the native body, and bones are the rig's."""
-    for file in files or [None]:
+    for file in files if files else [None]:
         motion = load_clip(file)
         contacts = motion.contacts
         if contacts is None:
             contacts = animate(layer, layer.identity({}), motion).contacts
-        known = leg_length(motion.skeleton) is not None
-        offsets = motion.skeleton if known else rest_offsets(layer.rig, layer.rig.bind_world)
+        assert contacts is not None
+        offsets, leg = motion.skeleton, leg_length(motion.skeleton)
+        if offsets is None or leg is None:
+            offsets = rest_offsets(layer.rig, layer.rig.bind_world)
+            leg = leg_length(offsets)
+        assert leg is not None
         slide = slide_of(recorded_joints(motion, offsets), contacts, motion.fps)
         name = file.stem if file else "range of motion"
-        yield _Clip(name=name, motion=motion, contacts=contacts, slide=slide, leg=leg_length(offsets))
+        yield _Clip(name=name, motion=motion, contacts=contacts, slide=slide, leg=leg)
 
 
 def _measured(layer: SomaLayer, identity: Identity, clip: _Clip, lock: str) -> tuple[float, float, float]:
     """Slide [mm/s], the same of the recorded body at this size, and median hover [mm]."""
     played = animate(layer, identity, replace(clip.motion, contacts=clip.contacts), contacts=lock)
+    assert played.feet is not None
     slide = slide_of(played.feet.joints, clip.contacts, clip.motion.fps)
-    scale = leg_length(played.motion.skeleton) / clip.leg
+    own = leg_length(played.motion.skeleton)
+    assert own is not None
+    scale = own / clip.leg
     hover = np.median(np.abs(played.feet.soles[clip.contacts])) if clip.contacts.any() else 0.0
     return _MM * slide, _MM * scale * clip.slide, _MM * float(hover)
 

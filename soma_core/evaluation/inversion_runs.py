@@ -139,7 +139,8 @@ def method_options(method: str) -> dict[str, Any]:
         )
     choice = OmegaConf.merge(OmegaConf.structured(InversionChoice), OmegaConf.load(path))
     values = OmegaConf.to_container(choice, enum_to_str=True)
-    return inversion_options(values)
+    assert isinstance(values, dict)
+    return inversion_options({str(key): value for key, value in values.items()})
 
 
 class _Run:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import torch
@@ -15,6 +16,7 @@ from soma_core.evaluation.pose_angle_meshes import BODIES, TestBody, drifting_hi
 from soma_core.evaluation.report import Figure, Table
 from soma_core.evaluation.shipped_layers import LayerMaker
 from soma_core.inversion import InversionResult, PoseInversion
+from soma_core.inversion.fit import Topology
 from soma_core.layer import SomaLayer
 from soma_core.rig.mesh import Lod
 from soma_core.skeleton.identity import Identity
@@ -148,7 +150,7 @@ def fit_frames(
     truth: Tensor | None = None,
     *,
     weights: Tensor | None = None,
-    topology: str = "canonical",
+    topology: Topology = "canonical",
 ) -> Fit:
     """Fit frames and compare them with the true rotations (F, J - 1, 3, 3), where they are known.
 
@@ -158,7 +160,7 @@ def fit_frames(
         truth: true rotations.
     """
     layer = inversion.layer
-    options = {"weights": weights, "topology": topology}
+    options: dict[str, Any] = {"weights": weights, "topology": topology}
     with torch.no_grad():
         first = weights[:1] if weights is not None and weights.ndim > 1 else weights
         inversion(vertices[:1], identity, **options | {"weights": first})  # compiles before the clock runs

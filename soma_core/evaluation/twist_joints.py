@@ -136,7 +136,8 @@ def _unchanged(layer: SomaLayer) -> list[Figure]:
 def run(config: DictConfig) -> Report:
     """Twist a forearm and a thigh of `config.experiment.backend` by 150 degrees, in float64."""
     layer = SomaLayer(config.experiment.backend, dtype=torch.float64, correctives=None)
-    figures, rows, bodies = [], [], []
+    figures, bodies = [], []
+    rows: list[list[str | float | None]] = []
     for name, *joints in _LIMBS:
         vertices, ends = _twisted(layer, *joints)
         volume = {key: enclosed_volume(points, layer.mesh.triangles) for key, points in vertices.items()}
