@@ -1,5 +1,6 @@
 """Unposing: what skinning did is undone, whatever is in the way."""
 
+import functools
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -7,7 +8,7 @@ import pytest
 import torch
 
 from soma_core.geometry.rotations import axis_angle_to_matrix
-from soma_core.inversion import PoseInversion
+from soma_core.inversion import InversionResult, PoseInversion
 from soma_core.inversion.unposing import Unposing
 from soma_core.layer import SomaLayer
 from tests.bodies import randn, tiny_canonical, tiny_registry
@@ -60,7 +61,8 @@ def test_what_the_full_model_adds_is_no_shape(poses):
         full.pose(body, turns, places).vertices,
         torch.ones(1, full.mesh.vertex_count).double(),
     )
-    pose = SimpleNamespace(rotations=turns, translation=places)
+    pose = SimpleNamespace(rotations=turns, translation=places, plain=torch.zeros(2, dtype=torch.bool))
+    pose.posed = functools.partial(InversionResult.posed, pose)
     found = Unposing(full, body)(vertices, weights, body, pose)
     torch.testing.assert_close(found, body.rest, atol=UNCHANGED_M, rtol=0)
 
