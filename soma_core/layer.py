@@ -66,15 +66,13 @@ class SomaLayer(PartialBodies):
         procedural: skin with the rig's twist joints where it has any; without, on the 78 public joints alone.
         correctives: checkpoint of pose correctives, None for none, or ``auto``: that of the shipped rig where
             its twist joints are in use and bodies are reposed. ``correctives_file`` says what was found.
-        validate: check that matrices are rotations. Finiteness is checked on CPU only, since on CUDA
-            that would wait for the device.
+        validate: check that matrices are rotations; finiteness on CPU only, where nothing waits for it.
         canonical: another mesh and rig than the shipped ones.
         assets: folder of SOMA's assets with all that belongs to them; default: that of ``soma assets show``.
         registry: where backends are looked up.
 
     Raises:
-        InputError: an unknown dtype, LOD or kernel choice.
-        BackendError: the backend is not installed or does not build.
+        InputError, BackendError: an unknown choice; the backend is not installed or does not build.
         AssetError: a checkpoint is missing, damaged or made for another rig.
     """
 
@@ -155,6 +153,11 @@ class SomaLayer(PartialBodies):
             f"backend={self.backend!r}, lod={self.mesh.lod!r}, procedural={self.procedural}, "
             f"correctives={str(self.correctives_file) if self.correctives_file else None!r}"
         )
+
+    @property
+    def faces(self) -> Any:
+        """Triangles of the posed vertices, a numpy array (t, 3) int32."""
+        return self.mesh.triangles
 
     @property
     def joint_names(self) -> tuple[str, ...]:
@@ -273,8 +276,7 @@ class SomaLayer(PartialBodies):
     ) -> Posed:
         """Pose by linear blend skinning on the public joints alone, without twist joints or correctives.
 
-        Takes and raises what :meth:`pose` does. Joints and their transforms are the same; the difference
-        of the vertices is what twist joints and correctives add.
+        Takes and raises what :meth:`pose` does. Joints are the same; the difference is that of the vertices.
         """
         body = self._body(identity, rotations, translation, bone_scale)
         plain, scale = self.animation, body.bone_scale
@@ -331,11 +333,7 @@ class SomaLayer(PartialBodies):
         return Body(identity, relative.expand(batch, *relative.shape[1:]), shift, bone_scale)
 
     def check_identity(self, identity: Identity) -> None:
-        """Refuse an identity that another kind of layer made: other rig, LOD, dtype or device.
-
-        Raises:
-            InputError: what differs.
-        """
+        """Refuse (InputError) one that another kind of layer made: other rig, LOD, dtype or device."""
         same_rig = not identity.rig_revision or identity.rig_revision == self.rig.revision
         if not same_rig or identity.rest.shape[1] != self.mesh.vertex_count:
             raise InputError(
@@ -374,9 +372,8 @@ class SomaLayer(PartialBodies):
         given = (*batch.values(), relative, shift, *([] if bone_scale is None else [bone_scale]))
         small = size <= _CHUNK or self.animation.warp_skinning
         at_once = self.fused.patches is not None if self.fused is not None else small
-        if (
-            not untracked(*given) or identities < size or at_once or not size
-        ):  # a compiler plans its own memory
+        # a compiler plans its own memory
+        if not untracked(*given) or identities < size or at_once or not size:
             identity = self._identity(batch, *self.rest_shape(batch))
             return self.pose_checked(Body(identity, relative, shift, bone_scale), absolute=absolute)
 

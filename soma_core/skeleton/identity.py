@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, fields, replace
+from typing import Any
 
 from torch import Tensor
 
@@ -36,3 +37,28 @@ class Identity:
     def batch_size(self) -> int:
         """Number of identities."""
         return self.rest.shape[0]
+
+    def __len__(self) -> int:
+        """Number of identities."""
+        return self.batch_size
+
+    def __getitem__(self, index: int | slice | Sequence[int] | Tensor) -> Identity:
+        """Some of them, as a batch still: one by its number, or by a slice, ids or a mask."""
+        if isinstance(index, int):
+            range(len(self))[index]  # IndexError where there is none, so that it can be iterated over
+            index = slice(index, index + 1 or None)
+        return self._with(lambda values: values[index])
+
+    def to(self, *args: Any, **kwargs: Any) -> Identity:
+        """Move or convert every tensor; takes what ``torch.Tensor.to`` does."""
+        return self._with(lambda values: values.to(*args, **kwargs))
+
+    def _with(self, change: Callable[[Tensor], Tensor]) -> Identity:
+        values = {each.name: getattr(self, each.name) for each in fields(self)}
+        changed = {name: change(value) for name, value in values.items() if isinstance(value, Tensor)}
+        return replace(self, **changed, params={name: change(value) for name, value in self.params.items()})
+
+    def __repr__(self) -> str:
+        """Counts instead of numbers."""
+        kind = f"{self.rest.dtype}, {self.rest.device}".removeprefix("torch.")
+        return f"Identity({len(self)} of {self.backend!r}, {self.rest.shape[1]} vertices, {kind})"
