@@ -55,7 +55,9 @@ class Identity:
 
     def _with(self, change: Callable[[Tensor], Tensor]) -> Identity:
         values = {each.name: getattr(self, each.name) for each in fields(self)}
-        changed = {name: change(value) for name, value in values.items() if isinstance(value, Tensor)}
+        changed: dict[str, Any] = {
+            name: change(value) for name, value in values.items() if isinstance(value, Tensor)
+        }
         return replace(self, **changed, params={name: change(value) for name, value in self.params.items()})
 
     def __repr__(self) -> str:
