@@ -89,6 +89,7 @@ def _usage() -> str:
         [
             "usage: soma <task> [key=value ...]",
             "       soma backends [list | show NAME | check NAME | new NAME] [--json]",
+            "       soma points [list | show NAME [--picture FILE.png] | check NAME]",
             "       soma assets [verify | show | use | path]",
             "       soma --version",
             "",
@@ -134,6 +135,10 @@ def _backends(arguments: Sequence[str]) -> int:
     return importlib.import_module("soma_core.tasks.backends").run_verb(arguments, _say)
 
 
+def _points(arguments: Sequence[str]) -> int:
+    return importlib.import_module("soma_core.tasks.points").run_verb(arguments, _say)
+
+
 def _assets(arguments: Sequence[str]) -> int:
     from soma_core.paths import assets_dir
 
@@ -164,7 +169,11 @@ def _assets(arguments: Sequence[str]) -> int:
     return EXIT_OK
 
 
-_VERBS: dict[str, Callable[[Sequence[str]], int]] = {"assets": _assets, "backends": _backends}
+_VERBS: dict[str, Callable[[Sequence[str]], int]] = {
+    "assets": _assets,
+    "backends": _backends,
+    "points": _points,
+}
 
 
 def _dispatch(arguments: Sequence[str]) -> int:

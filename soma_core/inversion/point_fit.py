@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
+from soma_core.geometry.rotations import axis_angle_to_matrix, matrix_to_axis_angle
 from soma_core.inversion._inputs import refuse_unit_error
 from soma_core.inversion.point_model import PointModel, PointRest
+from soma_core.inversion.point_rows import PointRows, rows_of
 from soma_core.inversion.point_start import PointStart
 from soma_core.inversion.problem import Pose, part_of
 from soma_core.inversion.result import InversionResult
@@ -36,6 +38,9 @@ _LEAST_CLAIM = 5e-4
 
 _STILL = 0.02
 """A frame rests when a step changes the root mean square error by less than this share of the noise."""
+
+_HIPS_PACE = 5.0
+"""Usual acceleration of the Hips [m/s^2]."""
 
 _ROUNDING = 1e-6
 """Relative to the matrix of the points: what is less is not told from nothing."""
@@ -113,7 +118,7 @@ class PointFit:
         self.origin = (every[..., None] * points).sum(1) / total
         self.points = (points - self.origin[:, None]) * (every > 0)[..., None]
         self.noise = _FIRST_NOISE if noise is None else noise
-        self.shift = torch.zeros_like(self.points)
+        self.shift, self.bridged = torch.zeros_like(self.points), False
         still = model.mean.expand(len(points), -1, 3, 3)
         self.pose = Pose.begin(still, torch.zeros_like(self.origin))
 
@@ -155,6 +160,33 @@ class PointFit:
         self._solve(max(self.noise, _FIRST_NOISE))
         if self.noise < _FIRST_NOISE:
             self._solve(_FIRST_NOISE, held=True)
+
+    def smooth(self, fps: float) -> None:
+        """Fit all frames together, each joint at its usual pace; frames without points are bridged."""
+        pose, model = self.pose, self.model
+        if len(pose.translation) < 3:
+            return
+        targets = self.points - self.shift + self.origin[:, None]
+        pace = torch.cat((model.pace[model.solver.variables], model.pace.new_tensor([_HIPS_PACE])))
+        rows = rows_of(targets, self.weights, max(self.noise, _FIRST_NOISE))
+        solve = PointRows(model, self.rest, rows, smooth=pace / fps**2)
+        found = solve(self._bridged(replace(pose, translation=pose.translation + self.origin)))
+        self.pose = replace(found, translation=found.translation - self.origin)
+        self.bridged = self.bridged | bool(self.valid.any())
+
+    def _bridged(self, pose: Pose) -> Pose:
+        """The pose in the world, frames that could not be fitted between those before and after them."""
+        good = torch.nonzero(self.valid).flatten()
+        if len(good) in (0, len(self.valid)):
+            return pose
+        at = torch.arange(len(self.valid), device=good.device)
+        after = torch.searchsorted(good, at).clamp(max=len(good) - 1)
+        first, last = good[(after - (good[after] > at).long()).clamp_min(0)], good[after]
+        share = ((at - first) / (last - first).clamp_min(1)).clamp(0, 1).to(pose.translation)
+        turn = matrix_to_axis_angle(pose.relative[last] @ pose.relative[first].mT)
+        relative = axis_angle_to_matrix(share[:, None, None] * turn) @ pose.relative[first]
+        hips = torch.lerp(pose.translation[first], pose.translation[last], share[:, None])
+        return replace(pose, relative=relative, translation=hips)
 
     def _sampled(self) -> PointFit:
         """A fit of some of the frames, evenly spaced, in which points have their way."""
@@ -251,9 +283,10 @@ class PointFit:
         eye = torch.eye(3, dtype=error.dtype, device=error.device)
         std = self._angle_std()
         surely = std < _SURE * self.model.spread[1:]
+        posed = valid | self.bridged
         return PointResult(
-            rotations=torch.where(valid[:, None, None, None], self.pose.relative, eye)[:, 1:],
-            translation=torch.where(valid[:, None], self.pose.translation + self.origin, 0.0),
+            rotations=torch.where(posed[:, None, None, None], self.pose.relative, eye)[:, 1:],
+            translation=torch.where(posed[:, None], self.pose.translation + self.origin, 0.0),
             vertex_error=error.masked_fill(~(known & valid[:, None]), torch.nan),
             valid=valid,
             determined=surely & valid[:, None],

@@ -63,6 +63,7 @@ class PointModel(torch.nn.Module):
         mean: (J, 3, 3) where a pose is expected.
         spread: (J,) root mean square angle [degrees] that each joint is expected to be off by.
         pull: (J, 3, 3) how strongly it is, as ``JointPrior.of`` says [1/rad^2].
+        pace: (J,) usual angular accelerations [rad/s^2].
         prior: (p, 4, 4) moments of the prior, of the solver's pairs [1/rad^2].
     """
 
@@ -70,6 +71,7 @@ class PointModel(torch.nn.Module):
     hold: Tensor
     mean: Tensor
     pull: Tensor
+    pace: Tensor
     spread: Tensor
 
     def __init__(self, layer: SomaLayer, places: PointPlaces, prior: JointPrior, *, warp: bool) -> None:
@@ -102,7 +104,7 @@ class PointModel(torch.nn.Module):
         keep = {
             "prior": moments, "mean": self.prior_mean,
             "parents": np.maximum(parents, 0), "weighted": structure.joints,
-            "spread": _spread(blocks), "pull": blocks, "hold": _HELD * _hold(structure.pairs),
+            "spread": _spread(blocks), "pull": blocks, "pace": prior.paces(rig.joint_names), "hold": _HELD * _hold(structure.pairs),
         }  # fmt: skip
         for key, array in keep.items():
             tensor = torch.as_tensor(np.ascontiguousarray(array), device=layer.device)

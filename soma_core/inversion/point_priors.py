@@ -21,12 +21,14 @@ class JointRange:
         rest: rotation vector [degrees] that it is expected at, in the axes of the world at T-pose.
         axis: of the first of the three spreads, in the same axes: what a hinge turns about.
         spread: standard deviations [degrees] about `axis`, and about every axis across it.
+        pace: usual angular acceleration [rad/s^2] in a motion.
         flexes: whether the joint is a hinge that bends the limb towards positive angles about `axis`.
     """
 
     rest: tuple[float, float, float] = (0.0, 0.0, 0.0)
     axis: tuple[float, float, float] = (1.0, 0.0, 0.0)
     spread: tuple[float, float] = (20.0, 20.0)
+    pace: float = 20.0
     flexes: bool = False
 
 
@@ -34,26 +36,26 @@ def _joints() -> dict[str, JointRange]:
     """Pattern -> range of the left side and the middle."""
     x, y, z = (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)
     return {
-        r"Spine1": JointRange(rest=(5, 0, 0), axis=y, spread=(6, 10)),
-        r"Spine2": JointRange(rest=(-3, 0, 0), axis=y, spread=(6, 8)),
-        r"Chest": JointRange(rest=(13, 0, 0), axis=y, spread=(8, 9)),
-        r"Neck1": JointRange(axis=y, spread=(10, 10)),
-        r"Neck2": JointRange(rest=(-4, 0, 0), axis=y, spread=(10, 6)),
-        r"Head": JointRange(rest=(-9, 0, 0), axis=y, spread=(15, 10)),
+        r"Spine1": JointRange(rest=(5, 0, 0), axis=y, spread=(6, 10), pace=8),
+        r"Spine2": JointRange(rest=(-3, 0, 0), axis=y, spread=(6, 8), pace=6),
+        r"Chest": JointRange(rest=(13, 0, 0), axis=y, spread=(8, 9), pace=8),
+        r"Neck1": JointRange(axis=y, spread=(10, 10), pace=10),
+        r"Neck2": JointRange(rest=(-4, 0, 0), axis=y, spread=(10, 6), pace=8),
+        r"Head": JointRange(rest=(-9, 0, 0), axis=y, spread=(15, 10), pace=12),
         r"Jaw": JointRange(axis=x, spread=(6, 3)),
         r"LeftEye": JointRange(rest=(-11, -4, 0), axis=x, spread=(6, 6)),
-        r"LeftShoulder": JointRange(rest=(14, -8, -6), axis=x, spread=(6, 10)),
-        r"LeftArm": JointRange(rest=(0, -12, -55), axis=x, spread=(20, 40)),
+        r"LeftShoulder": JointRange(rest=(14, -8, -6), axis=x, spread=(6, 10), pace=14),
+        r"LeftArm": JointRange(rest=(0, -12, -55), axis=x, spread=(20, 40), pace=25),
         r"LeftForeArm": JointRange(rest=(0, -45, 0), axis=(0, -1, 0), spread=(40, 4), flexes=True),
         r"LeftHand": JointRange(rest=(-8, -7, 4), axis=x, spread=(30, 20)),
         r"LeftHand(Index|Middle|Ring|Pinky)1": JointRange(axis=z, spread=(4, 4)),
         r"LeftHand(Index|Middle|Ring|Pinky)2": JointRange(axis=z, spread=(30, 8)),
         r"LeftHand(Index|Middle|Ring|Pinky)[34]": JointRange(axis=z, spread=(30, 4)),
         r"LeftHandThumb\d": JointRange(axis=x, spread=(15, 20)),
-        r"LeftLeg": JointRange(rest=(-16, 6, 6), axis=y, spread=(12, 30)),
-        r"LeftShin": JointRange(rest=(32, 0, 0), axis=x, spread=(35, 4), flexes=True),
-        r"LeftFoot": JointRange(rest=(-10, 3, -4), axis=y, spread=(10, 15)),
-        r"LeftToeBase": JointRange(rest=(-4, -2, 2), axis=x, spread=(12, 3)),
+        r"LeftLeg": JointRange(rest=(-16, 6, 6), axis=y, spread=(12, 30), pace=25),
+        r"LeftShin": JointRange(rest=(32, 0, 0), axis=x, spread=(35, 4), pace=40, flexes=True),
+        r"LeftFoot": JointRange(rest=(-10, 3, -4), axis=y, spread=(10, 15), pace=45),
+        r"LeftToeBase": JointRange(rest=(-4, -2, 2), axis=x, spread=(12, 3), pace=30),
     }
 
 
@@ -103,6 +105,11 @@ class JointPrior:
             pull[row] = along * np.outer(axis, axis) + about / 2 * (np.eye(3) - np.outer(axis, axis))
         return rest, pull
 
+    def paces(self, names: Sequence[str]) -> np.ndarray:
+        """Usual angular accelerations (J,) [rad/s^2]."""
+        found = [self.range_of(name) or JointRange() for name in names]
+        return np.array([one.pace for one in found])
+
     def hinges(self, names: Sequence[str]) -> dict[int, np.ndarray]:
         """Joint -> unit axis about which it bends the limb."""
         found = {row: self.range_of(name) for row, name in enumerate(names)}
@@ -116,4 +123,4 @@ def _mirrored(left: JointRange) -> JointRange:
     """The range of the other side: turns mirror as axial vectors, x stays, y and z change their sign."""
     flip = np.array([1.0, -1.0, -1.0])
     rest, axis = (tuple((flip * np.array(one)).tolist()) for one in (left.rest, left.axis))
-    return JointRange(rest=rest, axis=axis, spread=left.spread, flexes=left.flexes)
+    return JointRange(rest=rest, axis=axis, spread=left.spread, pace=left.pace, flexes=left.flexes)

@@ -89,8 +89,9 @@ class PointInversion(Derived):
         weights: Tensor | None = None,
         bone_scale: Tensor | None = None,
         initial: InversionResult | None = None,
+        fps: float | None = None,
     ) -> PointResult:
-        """Fit every frame.
+        """Fit every frame, on its own unless `fps` is given.
 
         Args:
             points: (F, P, 3) [m], +Y up, in the order of the point set; NaN where a point is not known.
@@ -98,6 +99,8 @@ class PointInversion(Derived):
             weights: (P,) or (F, P), relative inverse variances such as a detector's confidence; 0 leaves out.
             bone_scale: (1 or F, J - 1) known factors of the bone vectors, as in ``SomaLayer.pose``.
             initial: an earlier result for these frames, to begin from.
+            fps: frames per second of one motion: joints then turn at their usual pace, and frames with too
+                few points, which are not `valid`, are bridged. None for frames that are apart.
 
         Raises:
             InputError: a wrong shape, a negative weight, points in another unit than they should be.
@@ -122,6 +125,8 @@ class PointInversion(Derived):
             )  # fmt: skip
             fit.begin(initial)
             fit.run()
+            if fps is not None:
+                fit.smooth(fps)
             return fit.result(known)
 
     if TYPE_CHECKING:  # torch says that a module returns anything

@@ -1,0 +1,298 @@
+"""Files of points over time: arrays, tables, and what keypoint tools write."""
+
+from __future__ import annotations
+
+import csv
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from soma_core.errors import InputError
+from soma_core.io.data_files import DATA_SUFFIXES, open_data
+from soma_core.json_file import read_json
+
+__all__ = ["POINT_SUFFIXES", "PointFrames", "read_points"]
+
+POINT_SUFFIXES = (*DATA_SUFFIXES, ".csv", ".json")
+"""Files that may hold points; a folder of ``.json`` has a file a frame."""
+
+_KEYS = (
+    "points", "joints", "joints3d", "joints_3d", "keypoints", "keypoints3d", "keypoints_3d", "kpts3d", "positions",
+    "pred_keypoints_3d", "posed_joints", "poses3d", "xyz", "motion",
+)  # fmt: skip
+"""Names of an array of points in an NPZ or a pickle, the first that is there."""
+
+_SCORES = ("confidence", "confidences", "scores", "visibility", "weights", "conf")
+_RATES = ("fps", "framerate", "frame_rate", "mocap_framerate")
+_FLAT = 263
+"""Numbers a frame of HumanML3D's vectors."""
+
+_AXIS = re.compile(r"^(.*?)[ _.:-]*([xyz])(?:[ _]*\(?(?:m|mm|cm)\)?)?$", re.IGNORECASE)
+"""A column of a table: name and axis, with the unit behind it or not."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class PointFrames:
+    """Points as a file has them.
+
+    Attributes:
+        positions: (frames, P, 3) in the file's unit and axes; NaN where a point is not known.
+        confidence: (frames, P) from 0; None where the file has none.
+        fps: frames per second; None where the file does not say.
+        names: of the points, in order; None where the file does not say.
+        layout: what was read, in words.
+    """
+
+    positions: np.ndarray
+    confidence: np.ndarray | None = None
+    fps: float | None = None
+    names: tuple[str, ...] | None = None
+    layout: str = "an array"
+
+
+def read_points(path: Path, names: Sequence[str], *, person: str | None = None) -> PointFrames:
+    """Read a file, or a folder with a file a frame, whose points are `names` in this order.
+
+    A table with names in its head may have them in any order, and lack some.
+
+    Raises:
+        AssetError: missing, damaged, or not what its suffix says.
+        InputError: no array of so many points; points in a picture, which need their camera.
+    """
+    if path.is_dir():
+        found = _of_folder(path, person)
+    elif path.suffix.lower() == ".csv":
+        found = _of_table(path)
+    elif path.suffix.lower() == ".json":
+        found = _of_json(path, person)
+    else:
+        found = _of_data(path)
+    return _ordered(path, found, names)
+
+
+def _of_data(path: Path) -> PointFrames:
+    """Points of an NPZ, NPY, pickle or file of tensors."""
+    with open_data(path) as file:
+        content = file.content
+        if not isinstance(content, Mapping):
+            return _shaped(path, file.array(content), None, None)
+        known = {str(key).lower(): value for key, value in content.items()}
+        key = next((name for name in _KEYS if name in known), None)
+        if key is None and len(known) == 1:  # an NPY has one array without a name
+            key = next(iter(known))
+        if key is None:
+            raise InputError(
+                str(path), got="the keys " + ", ".join(map(str, content)), expected="points under " + ", ".join(_KEYS),
+                fix="Rename the array of points to 'points'.",
+            )  # fmt: skip
+        score = next((known[name] for name in _SCORES if name in known), None)
+        rate = next((known[name] for name in _RATES if name in known), None)
+        fps = None if rate is None else float(np.asarray(file.array(rate)).reshape(-1)[0])
+        values = file.array(known[key])
+        scores = None if score is None else file.array(score)
+    return _shaped(path, values, scores, fps)
+
+
+def _shaped(path: Path, values: np.ndarray, scores: np.ndarray | None, fps: float | None) -> PointFrames:
+    """An array as frames of points: (F, P, 3 or 4), (F, 3 P), one frame, or HumanML3D's vectors."""
+    values = np.squeeze(values) if values.ndim > 3 else values
+    if values.dtype.kind not in "fiu" or values.ndim not in (2, 3):
+        raise _no_points(path, values.shape, values.dtype)
+    values = values.astype(np.float64)
+    if values.ndim == 2 and values.shape[1] == _FLAT:
+        return PointFrames(positions=_of_humanml3d(path, values), fps=fps or 20.0, layout="HumanML3D's vectors")
+    if values.ndim == 2 and values.shape[1] in (3, 4):
+        values = values[None]
+    elif values.ndim == 2 and values.shape[1] % 3 == 0:
+        values = values.reshape(len(values), -1, 3)
+    if values.ndim != 3 or values.shape[2] not in (3, 4):
+        raise _no_points(path, values.shape, values.dtype)
+    if values.shape[2] == 4:
+        scores, values = values[..., 3], values[..., :3]
+    if scores is not None:
+        scores = np.broadcast_to(np.squeeze(scores), values.shape[:2]).astype(np.float64)
+    return PointFrames(positions=values, confidence=scores, fps=fps)
+
+
+def _no_points(path: Path, shape: object, kind: object) -> InputError:
+    flat = isinstance(shape, tuple) and len(shape) == 3 and shape[2] == 2
+    expected = "(frames, points, 3), with a confidence (frames, points, 4), or (frames, 263) of HumanML3D"
+    fix = "Give points in space: pixels need a camera, which soma_core.PointInversion.seen takes." if flat else (
+        "Save them as an array of that shape.")  # fmt: skip
+    return InputError(str(path), got=f"{shape} of {kind}", expected=expected, fix=fix)
+
+
+def _of_humanml3d(path: Path, data: np.ndarray) -> np.ndarray:
+    """Joint positions (F, 22, 3) [m] of HumanML3D's vectors: +Y up, the first frame at the origin, facing +Z."""
+    turn = np.concatenate(([0.0], np.cumsum(data[:-1, 0])))  # half the angle about the vertical
+    cosine, sine = np.cos(2 * turn), np.sin(2 * turn)
+
+    def back(vectors: np.ndarray) -> np.ndarray:
+        c, s = (one.reshape(-1, *[1] * (vectors.ndim - 2)) for one in (cosine, sine))
+        x, y, z = vectors[..., 0], vectors[..., 1], vectors[..., 2]
+        return np.stack((c * x - s * z, y, s * x + c * z), -1)
+
+    step = np.zeros((len(data), 3))
+    step[1:, 0], step[1:, 2] = data[:-1, 1], data[:-1, 2]
+    root = np.cumsum(back(step), axis=0)
+    root[:, 1] = data[:, 3]
+    joints = back(data[:, 4:67].reshape(len(data), 21, 3))
+    joints[..., [0, 2]] += root[:, None, [0, 2]]
+    height = float(np.median(data[:, 3]))
+    if not 0.05 < abs(height) < 3:
+        raise InputError(
+            str(path), got=f"a median height of {height:.3g} in the fourth number",
+            expected="HumanML3D's vectors in metres", fix="Undo the normalisation first: data * std + mean.",
+        )  # fmt: skip
+    return np.concatenate((root[:, None], joints), 1)
+
+
+def _of_table(path: Path) -> PointFrames:
+    """A CSV: a row a frame, three columns a point; with names in its head, or without a head."""
+    with open(path, newline="", encoding="utf-8-sig") as stream:
+        rows = [row for row in csv.reader(stream) if any(cell.strip() for cell in row)]
+    if not rows:
+        raise InputError(str(path), got="an empty table", expected="a row a frame", fix="Write it again.")
+    head = None if _numbers(rows[0]) is not None else [cell.strip() for cell in rows.pop(0)]
+    values = np.array([_cells(path, number, row, len(rows[0])) for number, row in enumerate(rows)])
+    if head is None:
+        return _shaped(path, values, None, None)
+    columns: dict[str, dict[str, int]] = {}
+    for place, title in enumerate(head):
+        match = _AXIS.match(title)
+        if match and match.group(1):
+            columns.setdefault(match.group(1), {})[match.group(2).lower()] = place
+    names = [name for name, axes in columns.items() if len(axes) == 3]
+    if not names:
+        raise InputError(
+            str(path), got="the columns " + ", ".join(head[:6]), expected="NAME_x, NAME_y and NAME_z of each point",
+            fix="Name the columns so, or leave out the head.",
+        )  # fmt: skip
+    taken = np.array([[columns[name][axis] for axis in "xyz"] for name in names])
+    rate = values[0, head.index("fps")] if "fps" in head else None
+    return PointFrames(positions=values[:, taken], names=tuple(names), fps=rate, layout="a table with names")
+
+
+def _numbers(cells: Sequence[str]) -> list[float] | None:
+    try:
+        return [float(cell) if cell.strip() else np.nan for cell in cells]
+    except ValueError:
+        return None
+
+
+def _cells(path: Path, number: int, row: Sequence[str], count: int) -> list[float]:
+    found = []
+    for cell in row:
+        try:
+            found.append(float(cell) if cell.strip() else np.nan)
+        except ValueError:
+            found.append(np.nan)
+    if len(found) != count:
+        raise InputError(
+            f"{path}, row {number}", got=f"{len(found)} cells", expected=f"{count}, as in the first",
+            fix="Write the table again.",
+        )  # fmt: skip
+    return found
+
+
+def _of_folder(path: Path, person: str | None) -> PointFrames:
+    """A folder of OpenPose or EasyMocap: a JSON file a frame, by the order of their names."""
+    files = sorted(path.glob("*.json"), key=lambda file: [int(n) if n.isdigit() else n for n in
+                   re.split(r"(\d+)", file.name)])  # fmt: skip
+    if not files:
+        raise InputError(str(path), got="no .json in it", expected="a file a frame", fix="Name their folder.")
+    frames = [_person(file, read_json(file, fix="Write it again."), person) for file in files]
+    return _stacked(path, frames, "a folder with a file a frame")
+
+
+def _of_json(path: Path, person: str | None) -> PointFrames:
+    """One JSON: a list of frames, or an object that has it under a known key."""
+    content = read_json(path, fix="Write it again, or as an NPZ.")
+    if isinstance(content, Mapping):
+        known = {str(key).lower(): value for key, value in content.items()}
+        rate = next((float(known[name]) for name in _RATES if name in known), None)
+        key = next((name for name in (*_KEYS, "frames", "data") if name in known), None)
+        if "people" not in known and key is not None:
+            found = _of_frames(path, known[key], person)
+            return PointFrames(**{**vars(found), "fps": rate or found.fps})
+        content = [content]
+    return _of_frames(path, content, person)
+
+
+def _of_frames(path: Path, frames: Any, person: str | None) -> PointFrames:
+    if isinstance(frames, list) and frames and isinstance(frames[0], (Mapping, list)):
+        inner = frames[0]
+        people = isinstance(inner, Mapping) or (inner and isinstance(inner[0], Mapping))
+        if people:
+            return _stacked(path, [_person(path, frame, person) for frame in frames], "frames of people")
+    try:
+        return _shaped(path, np.array(frames, np.float64), None, None)
+    except (TypeError, ValueError) as error:
+        if isinstance(error, InputError):
+            raise
+        raise _no_points(path, type(frames).__name__, "JSON") from error
+
+
+def _person(path: Path, frame: Any, person: str | None) -> np.ndarray | None:
+    """Points (P, 3 or 4) of one person in a frame; None where there is none."""
+    people = frame.get("people", frame.get("persons", [frame])) if isinstance(frame, Mapping) else frame
+    number = int(person) if person and person.isdigit() else 0
+    by_id = [one for one in people if isinstance(one, Mapping) and str(one.get("id", "")) == str(person)]
+    chosen = by_id[0] if by_id else (people[number] if number < len(people) else None)
+    if chosen is None:
+        return None
+    parts = []
+    for keys in (("keypoints3d", "pose_keypoints_3d", *_KEYS), ("hand_left_keypoints_3d",), ("hand_right_keypoints_3d",)):
+        key = next((name for name in keys if len(chosen.get(name, ())) > 0), None)
+        if key is not None:
+            values = np.array(chosen[key], np.float64)
+            parts.append(values.reshape(-1, 4) if values.ndim == 1 else values)
+    if not parts:
+        flat = any(str(key).endswith("_2d") and len(value) for key, value in chosen.items())
+        raise _no_points(path, (1, 0, 2) if flat else tuple(chosen), "JSON")
+    wide = min(part.shape[1] for part in parts)
+    return np.concatenate([part[:, :wide] for part in parts])
+
+
+def _stacked(path: Path, frames: Sequence[np.ndarray | None], layout: str) -> PointFrames:
+    shapes = {frame.shape for frame in frames if frame is not None}
+    if len(shapes) != 1:
+        got = "nobody in any frame" if not shapes else f"frames of {', '.join(map(str, sorted(shapes)))} numbers"
+        raise InputError(str(path), got=got, expected="the same points in every frame", fix="Write them again.")
+    empty = np.full(next(iter(shapes)), np.nan)
+    values = np.stack([empty if frame is None else frame for frame in frames])
+    found = _shaped(path, values, None, None)
+    return PointFrames(**{**vars(found), "layout": layout})
+
+
+def _ordered(path: Path, found: PointFrames, names: Sequence[str]) -> PointFrames:
+    """Points in the order of `names`; those of no confidence are not known."""
+    positions, confidence = found.positions, found.confidence
+    if confidence is not None:
+        gone = ~(confidence > 0)
+        positions = np.where(gone[..., None], np.nan, positions)
+        confidence = np.where(gone, 0.0, confidence)
+    if found.names is None and positions.shape[1] == len(names):
+        return PointFrames(**{**vars(found), "positions": positions, "confidence": confidence})
+    row = {_plain(name): place for place, name in enumerate(found.names or ())}
+    order = [row.get(_plain(name), -1) for name in names]
+    if max(order, default=-1) < 0:
+        few = ", ".join((found.names or ())[:5])
+        raise InputError(
+            str(path), got=f"{positions.shape[1]} points" + (f" called {few}, ..." if few else ""),
+            expected=f"{len(names)}: {', '.join(names[:5])}, ...",
+            fix="Choose the set that the file has: soma points list, points=NAME.",
+        )  # fmt: skip
+    unknown = np.array(order) < 0
+    positions = np.where(unknown[:, None], np.nan, positions[:, order])
+    return PointFrames(**{**vars(found), "positions": positions, "confidence": None, "names": tuple(names)})
+
+
+def _plain(name: str) -> str:
+    return re.sub(r"[^a-z0-9]", "", name.lower())
+
+
