@@ -16,7 +16,7 @@ from soma_core.paths import configs_dir
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
-OTHER_VERBS = {"backends", "assets"}
+OTHER_VERBS = {"backends", "assets", "points"}
 
 _SNIPPET = re.compile(
     r"<!-- runnable -->\n```python\n(?P<code>.*?)```\n(?:```text\n(?P<printed>.*?)```)?", re.DOTALL

@@ -1,9 +1,9 @@
-"""Point sets in `configs/points`, placed on the canonical mesh by anatomy: ``python -m assets.make.points``.
+"""Point sets in `configs/point_sets`, placed on the mesh by anatomy: ``python -m assets.make.points``.
 
 Joint centres are joints of the rig. Points of the skin are vertices found by rule on the left side and
-mirrored: the tip of the nose is the foremost vertex of the midline, eyelids and inner lips are the edges of the eye and
-mouth bags, a heel is the rearmost vertex of its foot, and so on. Nothing is taken from data of other models;
-only the names and the order of the points are those of the data sets.
+mirrored: the tip of the nose is the foremost vertex of the head, eyelids and inner lips are the edges of the
+eye and mouth bags, a heel is the rearmost vertex of its foot, and so on. Nothing is taken from data of other
+models; only the names and the order of the points are those of the data sets.
 """
 
 from __future__ import annotations
@@ -234,24 +234,25 @@ def _openpose(skin: Mapping[str, Place]) -> dict[str, Place]:
 
 
 _OPENPOSE_BONES = [
-    ["nose", "neck"], ["neck", "mid_hip"], ["neck", "left_shoulder"], ["neck", "right_shoulder"], ["mid_hip", "left_hip"],
-    ["mid_hip", "right_hip"], *_LIMB_BONES, *_HEAD_BONES,
+    ["nose", "neck"], ["neck", "mid_hip"], ["neck", "left_shoulder"], ["neck", "right_shoulder"],
+    ["mid_hip", "left_hip"], ["mid_hip", "right_hip"], *_LIMB_BONES, *_HEAD_BONES,
     *([f"{side}_ankle", f"{side}_{part}"] for side in ("left", "right") for part in ("big_toe", "heel")),
 ]  # fmt: skip
 
 _SMPL = {
-    "pelvis": "Hips", "left_hip": "LeftLeg", "right_hip": "RightLeg", "spine1": "Spine1", "left_knee": "LeftShin",
-    "right_knee": "RightShin", "spine2": "Spine2", "left_ankle": "LeftFoot", "right_ankle": "RightFoot",
-    "spine3": "Chest", "left_foot": "LeftToeBase", "right_foot": "RightToeBase", "neck": "Neck1",
-    "left_collar": "LeftShoulder", "right_collar": "RightShoulder", "head": "Head", "left_shoulder": "LeftArm",
-    "right_shoulder": "RightArm", "left_elbow": "LeftForeArm", "right_elbow": "RightForeArm", "left_wrist": "LeftHand",
-    "right_wrist": "RightHand",
+    "pelvis": "Hips", "left_hip": "LeftLeg", "right_hip": "RightLeg", "spine1": "Spine1",
+    "left_knee": "LeftShin", "right_knee": "RightShin", "spine2": "Spine2", "left_ankle": "LeftFoot",
+    "right_ankle": "RightFoot", "spine3": "Chest", "left_foot": "LeftToeBase", "right_foot": "RightToeBase",
+    "neck": "Neck1", "left_collar": "LeftShoulder", "right_collar": "RightShoulder", "head": "Head",
+    "left_shoulder": "LeftArm", "right_shoulder": "RightArm", "left_elbow": "LeftForeArm",
+    "right_elbow": "RightForeArm", "left_wrist": "LeftHand", "right_wrist": "RightHand",
 }  # fmt: skip
 _SMPL_BONES = [
-    ["pelvis", "left_hip"], ["pelvis", "right_hip"], ["pelvis", "spine1"], ["spine1", "spine2"], ["spine2", "spine3"],
-    ["spine3", "neck"], ["neck", "head"],
+    ["pelvis", "left_hip"], ["pelvis", "right_hip"], ["pelvis", "spine1"], ["spine1", "spine2"],
+    ["spine2", "spine3"], ["spine3", "neck"], ["neck", "head"],
     *(pair for side in ("left", "right") for pair in (
-        ["spine3", f"{side}_collar"], [f"{side}_collar", f"{side}_shoulder"], [f"{side}_ankle", f"{side}_foot"])),
+        ["spine3", f"{side}_collar"], [f"{side}_collar", f"{side}_shoulder"],
+        [f"{side}_ankle", f"{side}_foot"])),
     *_LIMB_BONES,
 ]  # fmt: skip
 
@@ -293,7 +294,8 @@ def _mhr70(skin: Mapping[str, Place]) -> dict[str, Place]:
     """The 70 keypoints of MHR and SAM 3D Body: body, feet, fingers from tip to root, arms, neck."""
     body = _coco(skin)
     points = {name: body[name] for name in ("nose", "left_eye", "right_eye", "left_ear", "right_ear",
-              "left_shoulder", "right_shoulder", "left_elbow", "right_elbow", "left_hip", "right_hip", "left_knee",
+              "left_shoulder", "right_shoulder", "left_elbow", "right_elbow", "left_hip", "right_hip",
+              "left_knee",
               "right_knee", "left_ankle", "right_ankle")}  # fmt: skip
     for side in ("left", "right"):
         points |= {f"{side}_{part}": skin[f"{side}_{part}"] for part in _FEET}
@@ -304,7 +306,7 @@ def _mhr70(skin: Mapping[str, Place]) -> dict[str, Place]:
         points[f"{side}_wrist"] = hand["wrist"]
     for part, joint in (("olecranon", "ForeArm"), ("cubital_fossa", "ForeArm"), ("acromion", "Arm")):
         for side in ("left", "right"):
-            away = {"olecranon": (0, 0, -0.035), "cubital_fossa": (0, 0, 0.035), "acromion": (0, 0.05, 0)}[
+            away = {"olecranon": (0, 0, -0.035), "cubital_fossa": (0, 0, 0.035), "acromion": (0, 0.03, 0)}[
                 part
             ]
             points[f"{side}_{part}"] = {"joint": side.capitalize() + joint, "offset": list(away)}
@@ -322,7 +324,8 @@ def _markers(marks: Landmarks, skin: Mapping[str, Place]) -> dict[str, Place]:
         "SHO": ("Arm", (-0.01, 0.08, 0)), "ELBL": ("ForeArm", (0.02, 0, -0.06)),
         "ELBM": ("ForeArm", (-0.03, -0.03, 0.05)), "WRA": ("Hand", (0.01, 0.02, 0.04)),
         "WRB": ("Hand", (0.01, 0.02, -0.04)), "FIN": ("HandMiddle2", (0.02, 0.02, 0)),
-        "ASI": ("Leg", (0.01, 0.09, 0.09)), "PSI": ("Leg", (-0.05, 0.1, -0.12)), "THI": ("Leg", (0.1, -0.2, 0)),
+        "ASI": ("Leg", (0.01, 0.09, 0.09)), "PSI": ("Leg", (-0.05, 0.1, -0.12)),
+        "THI": ("Leg", (0.1, -0.2, 0)),
         "KNE": ("Shin", (0.07, 0, 0)), "KNEM": ("Shin", (-0.07, 0, 0)), "TIB": ("Shin", (0.07, -0.2, 0)),
         "ANK": ("Foot", (0.06, 0, 0)),
     }  # fmt: skip
@@ -332,7 +335,9 @@ def _markers(marks: Landmarks, skin: Mapping[str, Place]) -> dict[str, Place]:
     def placed(joint: str, away: Sequence[float]) -> int:
         row = marks.rig.joint_names.index(joint)
         middle = np.abs(marks.places[:, 0]) < 1e-3
-        near = middle if joint in ("Neck1", "Chest") else weights[:, [row, marks.rig.parents[row]]].sum(1) > 0.3
+        near = (
+            middle if joint in ("Neck1", "Chest") else weights[:, [row, marks.rig.parents[row]]].sum(1) > 0.3
+        )
         owner = np.flatnonzero(near)
         return marks.near(marks.joint[joint] + np.array(away), owner)
 
@@ -372,8 +377,8 @@ def make_point_sets(folder: Path) -> list[Path]:
         "mhr70": ("The 70 keypoints of MHR and SAM 3D Body.", _mhr70(skin), coco_bones),
         "h36m17": ("The 17 joints of Human3.6M.", _h36m(skin), [["pelvis", "spine"], ["spine", "neck"],
                    ["neck", "nose"], ["nose", "head"], *_LIMB_BONES]),
-        "mano21-left": ("21 points of the left hand in the order of MediaPipe.", _hand("Left"), _hand_bones()),
-        "mano21-right": ("21 points of the right hand in the order of MediaPipe.", _hand("Right"), _hand_bones()),
+        "mano21-left": ("21 points of the left hand, in MediaPipe's order.", _hand("Left"), _hand_bones()),
+        "mano21-right": ("21 points of the right hand, in MediaPipe's order.", _hand("Right"), _hand_bones()),
         "markers38": ("An example of a set of markers on the skin.", _markers(marks, skin), []),
     }  # fmt: skip
     return [_write(folder / f"{name}.json", name, *one) for name, one in sets.items()]
@@ -391,4 +396,4 @@ def _write(path: Path, name: str, about: str, points: Mapping[str, Place], bones
 
 
 if __name__ == "__main__":
-    make_point_sets(configs_dir() / "points")
+    make_point_sets(configs_dir() / "point_sets")

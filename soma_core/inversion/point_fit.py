@@ -150,7 +150,7 @@ class PointFit:
 
     def run(self) -> None:
         """Fit, look at the noise, and at what twist joints and correctives do, and fit again."""
-        if self.given is None:
+        if self.given is None and bool(self.valid.any()):
             self.noise = self._sampled()._estimate()
         for _ in range(_CORRECTIONS if self.model.corrected else 0):
             self._solve(max(self.noise, _FIRST_NOISE))

@@ -104,7 +104,8 @@ class PointModel(torch.nn.Module):
         keep = {
             "prior": moments, "mean": self.prior_mean,
             "parents": np.maximum(parents, 0), "weighted": structure.joints,
-            "spread": _spread(blocks), "pull": blocks, "pace": prior.paces(rig.joint_names), "hold": _HELD * _hold(structure.pairs),
+            "spread": _spread(blocks), "pull": blocks, "pace": prior.paces(rig.joint_names),
+            "hold": _HELD * _hold(structure.pairs),
         }  # fmt: skip
         for key, array in keep.items():
             tensor = torch.as_tensor(np.ascontiguousarray(array), device=layer.device)

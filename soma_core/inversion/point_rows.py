@@ -1,9 +1,9 @@
 """Points row by row: all frames of a clip together, smooth in time, or as cameras see them.
 
 Unlike moments, rows know the direction of each residual (a pixel says nothing of its depth) and the frames
-around each frame. What is minimised is ``sum |r|^2 / noise^2`` over the rows, plus what is known of the joints,
-plus ``sum |a / s|^2`` over second differences a of every joint's turn and of the Hips, with what is usual for a
-person as s. Gauss-Newton steps on all frames; the matrix is banded, three frames wide.
+around each frame. What is minimised is ``sum |r|^2 / noise^2`` over the rows, plus what is known of the
+joints, plus ``sum |a / s|^2`` over second differences a of every joint's turn and of the Hips, with what is
+usual for a person as s. Gauss-Newton steps on all frames; the matrix is banded, three frames wide.
 """
 
 from __future__ import annotations
@@ -50,8 +50,8 @@ class PointRows:
     Args:
         model: of the points.
         rest: of one identity, or of one a frame.
-        rows: maps points (f, P, 3) [m] of some frames (a slice) to residuals (f, P, k), scaled by their noise,
-            and their derivatives (f, P, k, 3) by the points.
+        rows: maps points (f, P, 3) [m] of some frames (a slice) to residuals (f, P, k), scaled by their
+            noise, and their derivatives (f, P, k, 3) by the points.
         smooth: standard deviations (n + 1,) of second differences: of turns [rad] and of the Hips [m];
             None for frames that are apart.
     """
@@ -140,7 +140,9 @@ class PointRows:
         """Derivative (f, P, 3, d) of points by small turns of the variables in the axes of their parents."""
         at = self.model.weighted
         local = rest.local
-        y = torch.einsum("ftab,iptb->fpta" if len(local) == 1 else "ftab,fptb->fpta", turns[:, at], local[..., :3])
+        y = torch.einsum(
+            "ftab,iptb->fpta" if len(local) == 1 else "ftab,fptb->fpta", turns[:, at], local[..., :3]
+        )
         mass = local[..., 3]
         y = y + mass[..., None] * places[:, None, at]
         moved = torch.einsum("fpta,nt->fpna", y, self.below)
@@ -181,7 +183,9 @@ class PointRows:
         """Energy of second differences, and half its slope (F, d)."""
         assert self.smooth is not None
         if len(pose.translation) < 3:
-            return pose.translation.new_zeros(()), torch.zeros(len(pose.translation), self.size).to(pose.translation)
+            return pose.translation.new_zeros(()), torch.zeros(len(pose.translation), self.size).to(
+                pose.translation
+            )
         speed = self._velocity(pose)
         change = speed[1:] - speed[:-1]
         weight = self._stiffness()
@@ -226,6 +230,10 @@ class PointRows:
             band[far * size] += second[:, far, None] * weight
         return torch.as_tensor(
             scipy.linalg.solveh_banded(
-                band.reshape(2 * size + 1, -1), slope.ravel(), lower=True, overwrite_ab=True, check_finite=False
+                band.reshape(2 * size + 1, -1),
+                slope.ravel(),
+                lower=True,
+                overwrite_ab=True,
+                check_finite=False,
             ).reshape(frames, size)
         )

@@ -25,6 +25,10 @@ from soma_core.skeleton.identity import Identity
 __all__ = ["PointInversion", "PointResult"]
 
 
+_SHORT = 0.04
+"""Shorter bones tell no length of a person [m]."""
+
+
 class PointInversion(Derived):
     """Recovers the rig's rotations from named points; keeps no state between calls.
 
@@ -132,6 +136,44 @@ class PointInversion(Derived):
     if TYPE_CHECKING:  # torch says that a module returns anything
         __call__ = forward
 
+    @own_precision
+    def bone_scale(self, points: Tensor, identity: Identity) -> Tensor:
+        """Factors (1, J - 1) of the bone vectors that make a body as long in its parts as one that was seen.
+
+        A bone between two joints whose centres are points has the median of its lengths, the same on both
+        sides; all others have the factor of the whole body.
+
+        Args:
+            points: (F, P, 3) [m] of one person; NaN where a point is not known.
+            identity: the body that is scaled, batch of 1.
+
+        Raises:
+            InputError: a wrong shape.
+        """
+        points, layer = self._checked(points), self.layer
+        length = layer.animation.bone_vectors(identity).norm(dim=-1)[0]
+        centre, parents = self.start.centre, layer.rig.parents
+        seen: dict[str, list[float]] = {}
+        totals = [0.0, 0.0]
+        for joint, name in enumerate(layer.rig.joint_names):
+            above = int(parents[joint])
+            if joint < 2 or min(centre[joint], centre[above]) < 0 or length[joint] < _SHORT:
+                continue
+            away = (points[:, centre[joint]] - points[:, centre[above]]).norm(dim=-1).nanmedian()
+            if bool(torch.isfinite(away)):
+                seen.setdefault(_sideless(name), []).append(float(away / length[joint]))
+                totals = [totals[0] + float(away), totals[1] + float(length[joint])]
+        whole = totals[0] / totals[1] if totals[1] else self._size(points, identity)
+        known = {name: sum(values) / len(values) for name, values in seen.items()}
+        factors = [known.get(_sideless(name), whole) for name in layer.joint_names]
+        return points.new_tensor([factors])
+
+    def _size(self, points: Tensor, identity: Identity) -> float:
+        """Size of a person beside a body, where no bone is seen."""
+        known = torch.isfinite(points).all(-1)
+        rest = self.model.rest(identity)
+        return float(self.start(rest, points.nan_to_num(0.0), known.to(points))[2].median())
+
     def _checked(self, points: object) -> Tensor:
         if not isinstance(points, Tensor) or not points.is_floating_point():
             raise InputError(
@@ -145,3 +187,8 @@ class PointInversion(Derived):
                 fix="Order them as soma points show lists them, or take another point set.",
             )  # fmt: skip
         return points.to(self.layer.device, self.layer.dtype)
+
+
+def _sideless(name: str) -> str:
+    """A joint's name without its side."""
+    return name.removeprefix("Left").removeprefix("Right")

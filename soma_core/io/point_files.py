@@ -21,8 +21,8 @@ POINT_SUFFIXES = (*DATA_SUFFIXES, ".csv", ".json")
 """Files that may hold points; a folder of ``.json`` has a file a frame."""
 
 _KEYS = (
-    "points", "joints", "joints3d", "joints_3d", "keypoints", "keypoints3d", "keypoints_3d", "kpts3d", "positions",
-    "pred_keypoints_3d", "posed_joints", "poses3d", "xyz", "motion",
+    "points", "joints", "joints3d", "joints_3d", "keypoints", "keypoints3d", "keypoints_3d", "kpts3d",
+    "positions", "pred_keypoints_3d", "posed_joints", "poses3d", "xyz", "motion",
 )  # fmt: skip
 """Names of an array of points in an NPZ or a pickle, the first that is there."""
 
@@ -86,7 +86,8 @@ def _of_data(path: Path) -> PointFrames:
             key = next(iter(known))
         if key is None:
             raise InputError(
-                str(path), got="the keys " + ", ".join(map(str, content)), expected="points under " + ", ".join(_KEYS),
+                str(path), got="the keys " + ", ".join(map(str, content)),
+                expected="points under " + ", ".join(_KEYS),
                 fix="Rename the array of points to 'points'.",
             )  # fmt: skip
         score = next((known[name] for name in _SCORES if name in known), None)
@@ -104,7 +105,9 @@ def _shaped(path: Path, values: np.ndarray, scores: np.ndarray | None, fps: floa
         raise _no_points(path, values.shape, values.dtype)
     values = values.astype(np.float64)
     if values.ndim == 2 and values.shape[1] == _FLAT:
-        return PointFrames(positions=_of_humanml3d(path, values), fps=fps or 20.0, layout="HumanML3D's vectors")
+        return PointFrames(
+            positions=_of_humanml3d(path, values), fps=fps or 20.0, layout="HumanML3D's vectors"
+        )
     if values.ndim == 2 and values.shape[1] in (3, 4):
         values = values[None]
     elif values.ndim == 2 and values.shape[1] % 3 == 0:
@@ -121,13 +124,13 @@ def _shaped(path: Path, values: np.ndarray, scores: np.ndarray | None, fps: floa
 def _no_points(path: Path, shape: object, kind: object) -> InputError:
     flat = isinstance(shape, tuple) and len(shape) == 3 and shape[2] == 2
     expected = "(frames, points, 3), with a confidence (frames, points, 4), or (frames, 263) of HumanML3D"
-    fix = "Give points in space: pixels need a camera, which soma_core.PointInversion.seen takes." if flat else (
+    fix = "Give points in space; those of a picture say nothing of depth." if flat else (
         "Save them as an array of that shape.")  # fmt: skip
     return InputError(str(path), got=f"{shape} of {kind}", expected=expected, fix=fix)
 
 
 def _of_humanml3d(path: Path, data: np.ndarray) -> np.ndarray:
-    """Joint positions (F, 22, 3) [m] of HumanML3D's vectors: +Y up, the first frame at the origin, facing +Z."""
+    """Joints (F, 22, 3) [m] of HumanML3D's vectors: +Y up, from the origin, facing +Z at first."""
     turn = np.concatenate(([0.0], np.cumsum(data[:-1, 0])))  # half the angle about the vertical
     cosine, sine = np.cos(2 * turn), np.sin(2 * turn)
 
@@ -169,7 +172,8 @@ def _of_table(path: Path) -> PointFrames:
     names = [name for name, axes in columns.items() if len(axes) == 3]
     if not names:
         raise InputError(
-            str(path), got="the columns " + ", ".join(head[:6]), expected="NAME_x, NAME_y and NAME_z of each point",
+            str(path), got="the columns " + ", ".join(head[:6]),
+            expected="NAME_x, NAME_y and NAME_z of each point",
             fix="Name the columns so, or leave out the head.",
         )  # fmt: skip
     taken = np.array([[columns[name][axis] for axis in "xyz"] for name in names])
@@ -246,7 +250,11 @@ def _person(path: Path, frame: Any, person: str | None) -> np.ndarray | None:
     if chosen is None:
         return None
     parts = []
-    for keys in (("keypoints3d", "pose_keypoints_3d", *_KEYS), ("hand_left_keypoints_3d",), ("hand_right_keypoints_3d",)):
+    for keys in (
+        ("keypoints3d", "pose_keypoints_3d", *_KEYS),
+        ("hand_left_keypoints_3d",),
+        ("hand_right_keypoints_3d",),
+    ):
         key = next((name for name in keys if len(chosen.get(name, ())) > 0), None)
         if key is not None:
             values = np.array(chosen[key], np.float64)
@@ -261,8 +269,14 @@ def _person(path: Path, frame: Any, person: str | None) -> np.ndarray | None:
 def _stacked(path: Path, frames: Sequence[np.ndarray | None], layout: str) -> PointFrames:
     shapes = {frame.shape for frame in frames if frame is not None}
     if len(shapes) != 1:
-        got = "nobody in any frame" if not shapes else f"frames of {', '.join(map(str, sorted(shapes)))} numbers"
-        raise InputError(str(path), got=got, expected="the same points in every frame", fix="Write them again.")
+        got = (
+            "nobody in any frame"
+            if not shapes
+            else f"frames of {', '.join(map(str, sorted(shapes)))} numbers"
+        )
+        raise InputError(
+            str(path), got=got, expected="the same points in every frame", fix="Write them again."
+        )
     empty = np.full(next(iter(shapes)), np.nan)
     values = np.stack([empty if frame is None else frame for frame in frames])
     found = _shaped(path, values, None, None)
@@ -294,5 +308,3 @@ def _ordered(path: Path, found: PointFrames, names: Sequence[str]) -> PointFrame
 
 def _plain(name: str) -> str:
     return re.sub(r"[^a-z0-9]", "", name.lower())
-
-

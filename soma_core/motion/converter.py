@@ -20,7 +20,8 @@ from soma_core.motion.chunks import refuse_other_settings
 from soma_core.motion.files import Layout, ResultFiles, layout_of, no_motion, read, write
 from soma_core.motion.fit_job import FitJob, FitPlan, fit_settings, plan_body
 from soma_core.motion.models import FitBackends
-from soma_core.motion.options import ConvertOptions, InvertOptions
+from soma_core.motion.options import ConvertOptions, FitOptions, InvertOptions
+from soma_core.motion.pointed import from_points
 from soma_core.motion.products import BodyProducts
 from soma_core.motion.questions import heard, of_motion, say, unused_settings
 from soma_core.paths import expanded
@@ -106,6 +107,8 @@ class Converter:
             InputError: it holds no motion, or was fitted before with other settings.
         """
         before = _products_before(files.report)
+        if self._options.points is not None:
+            return self._pointed(path, files, before)
         layout, options = _known_layout(path), self._options
         retargeted = layout == "skeleton" or (layout in SMPL_LAYOUTS and options.carry == "skeleton")
         fitted = layout in FITTED and not retargeted
@@ -122,6 +125,17 @@ class Converter:
         if self._products is not None:
             report = dict(found.report)
             written |= self._products(path, files, report, before, fitted=fitted)
+            found = replace(found, report=report)
+        return replace(found, written=written)
+
+    def _pointed(self, path: Path, files: ResultFiles, before: Mapping[str, Any]) -> Converted:
+        """Fit a motion to the points of a file; its products are posed like those of rotations."""
+        with heard() as said:
+            found = points_to_motion(path, self._options, files, said, person=self._options.person)
+        written = dict(found.written)
+        if self._products is not None:
+            report = dict(found.report)
+            written |= self._products(path, files, report, before, fitted=False)
             found = replace(found, report=report)
         return replace(found, written=written)
 
@@ -240,6 +254,9 @@ def invert(source: str | Path, out: str | Path, *, options: InvertOptions | None
     """
     source, out, options = expanded(source), Path(out), options or InvertOptions()
     files = ResultFiles.of_folder(out)
+    if options.points is not None:
+        with heard() as said:
+            return points_to_motion(source, options, files, said)
     with heard() as said:
         body = open_body(source, "vertices", options)
     with body.posed.sequence as shown:
@@ -329,6 +346,19 @@ def earlier_report(
         return None  # the file was written anew
     refuse_other_settings(file, before, now)
     return report
+
+
+def points_to_motion(
+    path: Path, options: FitOptions, files: ResultFiles, said: list[str], *, person: str | None = None
+) -> Converted:
+    """Write the motion that was fitted to the points of a file, and a report."""
+    found = from_points(path, options, person=person)
+    write(found.motion, files.motion)
+    settings = {"input": str(path.resolve()), "layout": "points", "fps": found.motion.fps}
+    report = {"settings": settings, "frames": found.motion.frame_count, "identity": None, **found.report,
+              "warnings": said}  # fmt: skip
+    atomic_text(files.report, json.dumps(report, indent=2) + "\n")
+    return Converted(report=report, files=files, written={"npz": files.motion})
 
 
 def _refuse_failed(path: Path, report: Mapping[str, Any], file: Path) -> None:

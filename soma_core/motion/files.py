@@ -130,7 +130,7 @@ def no_motion(path: Path) -> tuple[InputError, bool]:
     if path.suffix.lower() == ".npz":
         shown = ", ".join(names)
     vertices = any(name == "vertices" or name.endswith("_vertices") for name in names)
-    takes = "vertices over time are what soma invert input=FILE takes"
+    takes = "vertices over time are what soma invert input=FILE takes; points, what points=NAME is for"
     return InputError(
         str(path),
         got=f"the keys {shown or '(none)'}",

@@ -57,6 +57,7 @@ class SourceOptions(Options):
         unit: of lengths.
         up: upward axis of the world.
         axes: of the world by name, instead: ``camera`` has y down and z forward.
+        points: the set that a file of points has, or a JSON file of one's own; None for other files.
     """
 
     backend: BackendChoice | None = None
@@ -66,6 +67,7 @@ class SourceOptions(Options):
     unit: LengthUnit | None = None
     up: Upward | None = None
     axes: Axes | None = None
+    points: str | None = None
 
     @property
     def upward(self) -> UpAxis | None:

@@ -16,7 +16,7 @@ from soma_core.plugin.registry import Registry, default_registry
 
 __all__ = ["Point", "PointSet", "find_point_sets", "load_point_set", "read_point_set"]
 
-_FOLDER = "points"
+_FOLDER = "point_sets"
 
 _SUM = 1e-6
 """How far the weights of one point may be from one."""

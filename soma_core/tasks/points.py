@@ -65,7 +65,9 @@ def _show(options: argparse.Namespace) -> str:
 def _where(point: Point) -> str:
     """A place in words."""
     parts = [f"{weight:g} {joint}" if weight != 1 else joint for joint, weight in point.joints.items()]
-    parts += [f"{weight:g} vertex {v}" if weight != 1 else f"vertex {v}" for v, weight in point.vertices.items()]
+    parts += [
+        f"{weight:g} vertex {v}" if weight != 1 else f"vertex {v}" for v, weight in point.vertices.items()
+    ]
     away = f" + ({', '.join(f'{value:g}' for value in point.offset)}) m" if any(point.offset) else ""
     return " + ".join(parts) + away
 

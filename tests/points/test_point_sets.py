@@ -100,8 +100,8 @@ def test_names_that_are_none_are_refused(tmp_path: Path) -> None:
 
 
 def test_a_plugin_ships_sets_of_its_own(tmp_path: Path) -> None:
-    (tmp_path / "points").mkdir()
-    file = tmp_path / "points" / "lab12.json"
+    (tmp_path / "point_sets").mkdir()
+    file = tmp_path / "point_sets" / "lab12.json"
     file.write_text(json.dumps({"points": {"clavicle": "Chest"}}), encoding="utf-8")
 
     class Plugins(Registry):

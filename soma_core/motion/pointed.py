@@ -1,0 +1,178 @@
+"""Motions from points: files of joints, keypoints or markers, fitted on this skeleton."""
+
+from __future__ import annotations
+
+import logging
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+
+from soma_core.errors import InputError
+from soma_core.inversion.points import PointInversion
+from soma_core.io.motion import Motion
+from soma_core.io.point_files import PointFrames, read_points
+from soma_core.motion.models import open_layer
+from soma_core.motion.options import SIGNED, FitOptions
+from soma_core.motion.posed_input import world_axes
+from soma_core.motion.questions import Names, of_motion, of_rate, say
+from soma_core.points.point_set import load_point_set
+from soma_core.topology.frames import METRES
+
+if TYPE_CHECKING:
+    from soma_core.inversion.point_fit import PointResult
+    from soma_core.layer import SomaLayer
+
+__all__ = ["Pointed", "from_points"]
+
+_log = logging.getLogger(__name__)
+
+_SIZES = (0.6, 1.5)
+"""A person this much smaller or larger than the body is said; a newborn has 0.3 of an adult."""
+
+
+class Pointed:
+    """A motion that was fitted to points.
+
+    Attributes:
+        motion: on this skeleton, of the body with the lengths of the points.
+        report: figures for people and programs.
+    """
+
+    def __init__(self, motion: Motion, report: dict[str, Any]) -> None:
+        self.motion, self.report = motion, report
+
+
+def from_points(path: Path, options: FitOptions, *, person: str | None = None) -> Pointed:
+    """Read points of a set, and fit a motion to them.
+
+    Raises:
+        SomaError: the file, the set or the backend cannot be used, or no frame has enough points.
+    """
+    assert options.points is not None
+    points = load_point_set(options.points)
+    found = read_points(path, points.names, person=person)
+    fps = options.fps or found.fps
+    if fps is None:
+        raise InputError(
+            f"{path.name}: fps", got="none", expected="frames per second", fix="Pass fps=30 (the true rate)."
+        )
+    say(path.name, of_rate(fps))
+    name = options.backend.name if options.backend is not None else "soma"
+    given = dict(options.backend.options) if options.backend is not None else {}
+    layer = open_layer(options, name, given)
+    places, scale = _in_metres(path, found, options)
+    inversion = PointInversion(layer, points)
+    identity = layer.identity(dict(options.backend.params) if options.backend is not None else {})
+    lengths = inversion.bone_scale(places, identity)
+    weights = None if found.confidence is None else torch.as_tensor(found.confidence).to(places)
+    try:
+        result = inversion(places, identity, weights=weights, bone_scale=lengths, fps=fps)
+    except InputError as error:
+        if error.argument == "points" and "Multiply" in error.fix:
+            raise _unit_error(path, error, scale) from error
+        raise
+    if not bool(result.valid.any()):
+        raise InputError(
+            str(path), got="three known points in no frame", expected=f"points of {points.name}",
+            fix="Look at the order of the points, and at their confidence.",
+        )  # fmt: skip
+    motion = _motion(path, layer, result, lengths, fps)
+    names = Names(ups=tuple(SIGNED) if options.upward is None else ())
+    said = [*of_motion(motion, names), *_doubts(result, lengths)]
+    say(path.name, said)
+    report = _report(points.name, found, result, lengths, motion)
+    _log.info(
+        "%s: %s, %d frames of %d points at %g fps; noise %.1f mm",
+        path.name, found.layout, motion.frame_count, len(points), fps, 1e3 * result.noise,
+    )  # fmt: skip
+    return Pointed(motion, report)
+
+
+def _in_metres(path: Path, found: PointFrames, options: FitOptions) -> tuple[torch.Tensor, float]:
+    """Points (F, P, 3) [m], +Y up, and the length of the file's unit [m] as it was taken."""
+    metres = options.metres
+    if metres is None:
+        metres = _told_unit(path, found.positions)
+    axes = np.eye(3) if options.upward is None else world_axes(options.upward)
+    places = metres * found.positions @ axes.T
+    return torch.as_tensor(places).to(options.device, torch.float32), metres
+
+
+def _told_unit(path: Path, positions: np.ndarray) -> float:
+    """Length of the unit [m] by the extent of a body: 0.4 to 2.6 m in the largest direction."""
+    known = np.isfinite(positions).all(-1)
+    seen, known = positions[known.sum(1) > 2], known[known.sum(1) > 2][..., None]
+    extents = np.where(known, seen, -np.inf).max(1) - np.where(known, seen, np.inf).min(1)
+    if not len(extents):
+        return 1.0
+    extent = float(np.median(extents.max(1)))
+    if extent == 0:
+        raise InputError(
+            str(path), got=f"all points at one place, in {len(extents)} frames",
+            expected="points of a person", fix="Look at how the file was written.",
+        )  # fmt: skip
+    for unit in ("m", "cm", "mm"):
+        if 0.4 < extent * METRES[unit] < 2.6:
+            if unit != "m":
+                say(path.name, [f"points span {extent:.4g}: taken for {unit}; if they are not, pass unit=m"])
+            return METRES[unit]
+    return 1.0
+
+
+def _unit_error(path: Path, error: InputError, metres: float) -> InputError:
+    return InputError(
+        f"{path.name}: unit", got=f"{error.got}, in units of {metres:g} m", expected="a person",
+        fix="Pass unit=m, cm or mm as the points are stored, or backend.params of a body of that size.",
+    )  # fmt: skip
+
+
+def _motion(path: Path, layer: SomaLayer, result: PointResult, lengths: torch.Tensor, fps: float) -> Motion:
+    bones = layer.animation.bone_vectors(layer.identity(), lengths)[0, 1:].cpu().numpy()
+    return Motion(
+        rotations=result.rotations.cpu().numpy(),
+        translation=result.translation.cpu().numpy(),
+        fps=fps,
+        joint_names=layer.joint_names,
+        rig_revision=layer.rig.revision,
+        source=str(path),
+        skeleton=bones,
+    )
+
+
+def _doubts(result: PointResult, lengths: torch.Tensor) -> list[str]:
+    """What is doubtful about a fit: its size, its error, frames that were bridged."""
+    told, size = [], float(lengths.mean())
+    if not _SIZES[0] < size < _SIZES[1]:
+        told.append(
+            f"the person is {size:.2g} times the body's size; pass unit=m, cm or mm if that is not so"
+        )
+    gone = int((~result.valid).sum())
+    if gone:
+        told.append(f"{gone} frames with fewer than three known points are bridged")
+    if result.noise > 0.03:
+        told.append(
+            f"points miss the body by {1e3 * result.noise:.0f} mm; is their order that of the set? "
+            "`soma points list` has others"
+        )
+    return told
+
+
+def _report(
+    name: str, found: PointFrames, result: PointResult, lengths: torch.Tensor, motion: Motion
+) -> dict:
+    error = 1e3 * result.point_error[torch.isfinite(result.point_error)]
+    figures = {
+        "mean": float(error.mean()), "p95": float(error.quantile(0.95)), "max": float(error.max())
+    } if len(error) else {"mean": None, "p95": None, "max": None}  # fmt: skip
+    std = result.angle_std[result.valid].nanmedian(0).values
+    names = motion.joint_names
+    return {
+        "points": name, "layout": found.layout, "error_mm": {"all": figures},
+        "noise_mm": 1e3 * result.noise, "valid_frames": int(result.valid.sum()),
+        "size": float(lengths.mean()),
+        "bone_scale": {joint: round(float(v), 4) for joint, v in zip(names, lengths[0], strict=True)},
+        "angle_std_degrees": {joint: round(float(v), 2) for joint, v in zip(names, std, strict=True)},
+        "determined": [names[place] for place in torch.nonzero(result.determined.any(0)).flatten().tolist()],
+    }  # fmt: skip

@@ -1,0 +1,85 @@
+"""Motions from files of points: the pose comes back, unit and axes are questioned, gaps are bridged."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from soma_core import SomaLayer
+from soma_core.errors import InputError
+from soma_core.io.motion_files import read_motion
+from soma_core.motion import ConvertOptions, InvertOptions, convert_file, invert, load_clip
+
+LAYER = SomaLayer("soma", lod="low")
+CLIP = load_clip().cut(slice(0, 24))
+POSED = LAYER.joints(LAYER.identity(), torch.as_tensor(CLIP.rotations), torch.as_tensor(CLIP.translation))
+POINTS = LAYER.points(POSED, "smpl22").numpy()
+
+
+def _run(tmp_path: Path, values: np.ndarray, **options: object):
+    np.save(tmp_path / "points.npy", values)
+    given = ConvertOptions(**({"points": "smpl22", "fps": 30, "lod": "low"} | options))
+    found = convert_file(tmp_path / "points.npy", tmp_path / "out", options=given)
+    motion = read_motion(found.files.motion)
+    again = LAYER.joints(
+        LAYER.identity(), torch.as_tensor(motion.rotations), torch.as_tensor(motion.translation)
+    )
+    return found, LAYER.points(again, "smpl22").numpy()
+
+
+def test_points_become_a_motion_that_meets_them(tmp_path: Path) -> None:
+    gaps = POINTS.copy()
+    gaps[10:12] = np.nan
+    found, again = _run(tmp_path, gaps)
+    assert np.abs(again - POINTS).max() < 0.02  # the bridged frames as well [m]
+    assert np.linalg.norm(again - POINTS, axis=-1)[:8].mean() < 1e-3
+    assert found.report["valid_frames"] == 22
+    assert any("bridged" in one for one in found.report["warnings"])
+
+
+def test_units_and_axes_are_told_or_questioned(tmp_path: Path) -> None:
+    found, again = _run(tmp_path, 100 * POINTS)
+    assert any("taken for cm" in one for one in found.report["warnings"])
+    assert np.linalg.norm(again - POINTS, axis=-1).mean() < 1e-3
+    upright = POINTS[..., [0, 2, 1]] * [1, -1, 1]  # +Z up
+    found, _ = _run(tmp_path, upright)
+    assert any("up=z" in one for one in found.report["warnings"])
+    found, again = _run(tmp_path, upright, up="z")
+    assert not found.report["warnings"]
+    assert np.linalg.norm(again - POINTS, axis=-1).mean() < 1e-3
+
+
+def test_another_person_keeps_the_lengths_of_the_points(tmp_path: Path) -> None:
+    found, _ = _run(tmp_path, 0.8 * POINTS)
+    scale = found.report["bone_scale"]
+    assert [scale[name] for name in ("LeftShin", "RightForeArm", "HeadEnd")] == pytest.approx(
+        [0.8] * 3, abs=1e-3
+    )
+    assert found.error_mm is not None
+    assert found.error_mm["mean"] < 1
+
+
+def test_invert_takes_points_as_well(tmp_path: Path) -> None:
+    np.savez(tmp_path / "points.npz", points=POINTS, fps=30)
+    options = InvertOptions(points="smpl22", lod="low")
+    found = invert(tmp_path / "points.npz", tmp_path / "out", options=options)
+    assert json.loads(found.files.report.read_text(encoding="utf-8"))["points"] == "smpl22"
+
+
+@pytest.mark.parametrize(
+    ("points", "options", "said"),
+    [
+        (POINTS, {"fps": None}, "fps=30"),
+        (POINTS * 0, {}, "at one place"),
+        (POINTS * np.nan, {}, "in no frame"),
+        (POINTS[:, :17], {}, "got 17 points"),
+        (POINTS, {"points": "smpl23"}, "points=smpl2"),
+    ],
+)
+def test_what_is_no_motion_is_refused(tmp_path: Path, points, options, said: str) -> None:
+    with pytest.raises(InputError, match=said):
+        _run(tmp_path, points, **options)
