@@ -60,7 +60,7 @@ def point_picture(
     with open_stage((_TALL, _TALL)) as stage:
         pictures = []
         for panel in panels:
-            picture = stage.shot([body], focus=panel.focus, height=panel.height, flat=True)
+            picture = stage.shot([body], focus=panel.focus.tolist(), height=panel.height, flat=True)
             pictures.append(_marked(picture, panel, names, places, bones))
     sheet = Image.new("RGB", (_TALL * len(pictures), _TALL))
     for number, picture in enumerate(pictures):
