@@ -46,6 +46,7 @@ if TYPE_CHECKING:
     from soma_core.plugin.registry import default_registry
     from soma_core.points.point_set import Point, PointSet, load_point_set
     from soma_core.rig.canonical import load_canonical
+    from soma_core.rig.landmarks import canonical_landmarks
     from soma_core.rig.mesh import CanonicalMesh
     from soma_core.rig.neutral import ShapeSpace, load_shape_space
     from soma_core.rig.skeleton import Rig
@@ -88,6 +89,7 @@ __all__ = [
     "VertexSequence",
     "__version__",
     "assets_dir",
+    "canonical_landmarks",
     "default_registry",
     "diagnose_fit",
     "fit_identity",
@@ -113,6 +115,7 @@ _HOMES = {
     "soma_core.animation.posed": ["Posed"],
     # The canonical mesh, its rig and its shape space
     "soma_core.rig.canonical": ["load_canonical"],
+    "soma_core.rig.landmarks": ["canonical_landmarks"],
     "soma_core.rig.mesh": ["CanonicalMesh"],
     "soma_core.rig.skeleton": ["Rig"],
     "soma_core.rig.neutral": ["ShapeSpace", "load_shape_space"],

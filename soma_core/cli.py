@@ -90,7 +90,7 @@ def _usage() -> str:
             "usage: soma <task> [key=value ...]",
             "       soma backends [list | show NAME | check NAME | new NAME] [--json]",
             "       soma points [list | show NAME [--picture FILE.png] | check NAME]",
-            "       soma assets [verify | show | use | path]",
+            "       soma assets [verify | show | use | path | landmarks]",
             "       soma --version",
             "",
             "tasks (soma <task> --help shows what can be set):",
@@ -149,6 +149,8 @@ def _assets(arguments: Sequence[str]) -> int:
     verify = verbs.add_parser("verify", help="check every file against MANIFEST.json")
     verify.add_argument("--root", type=Path, default=assets_dir(), help="folder (default: %(default)s)")
     verbs.add_parser("path", help="print the folder")
+    landmarks = verbs.add_parser("landmarks", help="list the named points of the canonical mesh")
+    landmarks.add_argument("picture", type=Path, nargs="?", help="PNG file to draw them into")
     show = verbs.add_parser("show", help="what a folder holds, what can be used of it, what is missing")
     show.add_argument("root", type=Path, nargs="?", metavar="FOLDER", help="default: the one in use")
     use = verbs.add_parser("use", help="use another folder from now on, such as the published assets of SOMA")
@@ -160,6 +162,8 @@ def _assets(arguments: Sequence[str]) -> int:
     task = importlib.import_module("soma_core.tasks.assets")
     if options.verb == "show":
         _say("\n".join(task.show_assets(options.root)))
+    elif options.verb == "landmarks":
+        _say(task.list_landmarks(options.picture))
     elif options.verb == "use":
         _say(task.use_assets(options.root))
     else:

@@ -23,7 +23,8 @@ from soma_core.errors import InputError, SomaError
 
 __all__ = ["Task", "run_task"]
 
-Task: TypeAlias = Callable[[DictConfig, Path], None]
+Task: TypeAlias = Callable[[DictConfig, Path], Path | None]
+"""Takes the configuration and the folder of the run; returns where else its result lies, if not there."""
 
 
 def run_task(
@@ -62,13 +63,13 @@ def run_task(
                 check_backend_choice(config)
                 _check_device(config)
                 write_provenance(folder, config, command=[*program.split(), *overrides])
-                task()(config, folder)
+                result = task()(config, folder)
         except SomaError as error:
             if os.environ.get("SOMA_STRICT") == "1":
                 raise
             report(with_settings(error))
         else:
-            report(folder)
+            report(result or folder)
         running.clear()
 
     with _hydra_process(program, literal_texts(overrides, SCHEMAS[config_name])):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -22,6 +23,7 @@ from soma_core.choices import (
 from soma_core.motion.options import ConvertOptions, InvertOptions
 from soma_core.motion.writers import WriteOptions, listed_writers
 from soma_core.options import BackendChoice, FrameRange, ModelOptions, Options, Picture, ViewOptions
+from soma_core.paths import configs_dir
 
 __all__ = [
     "SCHEMAS",
@@ -230,9 +232,26 @@ def _listed_products(program: str) -> str:
     return f"Products, write=[NAME,...]:\n{listed_writers()}\n\n"
 
 
+_EXPLAINED = re.compile(r"^(?:  - )?(?P<key>[a-z]\w*): [^#]*# (?P<text>.+)$", re.MULTILINE)
+"""A key of a task or of its defaults in a file, and the comment beside it."""
+
+
+def _explained_keys(program: str) -> str:
+    """What the comments in a task's file say of its keys."""
+    task = program.partition(" ")[2].replace("-", "_")
+    if task not in SCHEMAS:
+        return ""
+    text = (configs_dir() / f"{task}.yaml").read_text(encoding="utf-8")
+    rows = [(line["key"], line["text"]) for line in _EXPLAINED.finditer(text)]
+    width = max((len(key) for key, _ in rows), default=0)
+    lines = [f"  {key:<{width}}  {text}" for key, text in rows]
+    return "\n".join(["What keys mean:", *lines, "", ""]) if lines else ""
+
+
 def register_schemas() -> None:
     """Make the schemas known to hydra under ``<task>_schema``; safe to call again."""
     OmegaConf.register_new_resolver("soma_products", _listed_products, replace=True)
+    OmegaConf.register_new_resolver("soma_keys", _explained_keys, replace=True)
     store = ConfigStore.instance()
     for task, schema in SCHEMAS.items():
         store.store(name=f"{task}_schema", node=schema)

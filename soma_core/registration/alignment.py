@@ -16,8 +16,8 @@ from soma_core.registration.target import Frame, Skin, find_unit
 
 __all__ = ["Start", "find_starts"]
 
-_ARMS = (0.0, 0.5, 1.0, 1.4)
-"""Poses that are tried, on the way from the T-pose (0) to the bind pose (1)."""
+_ARMS = (0.0, 0.5, 1.0, 1.4, 1.8)
+"""Poses that are tried, on the way from the T-pose (0) to the bind pose (1) and on to hanging arms."""
 
 _ROUGHLY, _LEFT = 200, 12
 """Samples in a first look at all starts, and how many of these are looked at well."""

@@ -16,6 +16,7 @@ import scipy.linalg
 from scipy.spatial.transform import Rotation
 
 from soma_core.registration.body_model import BodyModel, BodyPose
+from soma_core.registration.digits import Digits, digit_guide
 from soma_core.registration.surface import Surface
 
 __all__ = ["BodyFit", "fit_body"]
@@ -31,6 +32,9 @@ _FACING = 0.3
 
 _TANGENT = 0.1
 """Weight of the distance along the surface: little, so that parts slide into place."""
+
+_HOLD = 30.0
+"""Weight of a landmark and of the middle of a part of a finger against a vertex."""
 
 _ACROSS = math.sqrt(1 + _TANGENT**2) - _TANGENT
 """What the distance across it weighs more: the root of ``n n^T + t^2`` is ``t + _ACROSS n n^T``."""
@@ -56,7 +60,7 @@ class _Pull:
     """Points of the model (convex combinations of vertices) and where they should be.
 
     Attributes:
-        vertices, shares: (m, 3) ids and weights.
+        vertices, shares: (m, k) ids and weights.
         points: (m, 3) where the combinations are now.
         targets, normals: (m, 3).
         weights: (m,).
@@ -80,6 +84,7 @@ def fit_body(
     ends: float = 1.0,
     samples: int = 3000,
     landmarks: tuple[np.ndarray, np.ndarray] | None = None,
+    digits: Digits | None = None,
 ) -> BodyFit:
     """Fit from one start, one Gauss-Newton step for each entry of `scales`.
 
@@ -92,18 +97,27 @@ def fit_body(
         ends: factor of the pull of fingers and feet to their start.
         samples: how many points of the surface are drawn to the model.
         landmarks: ids of vertices of the model's LOD and their positions (m, 3).
+        digits: fingers and toes of the surface, whose labels it has.
     """
     stride = max(1, len(surface.vertices) // samples)
     chosen = np.arange(0, len(surface.vertices), stride)
     pose, derivative, cost = start, None, np.inf
+    labels = None if digits is None else digits.own[: model.mesh.vertex_count]
     for number, scale in enumerate(scales):
         vertices, joints = model.evaluate(pose)
         if shaped and number % 4 == 0:
             derivative = model.shape_derivative(pose)
-        pulls = [*_pulls(model, surface, vertices, chosen, scale)]
+        pulls = [*_pulls(model, surface, vertices, chosen, scale, labels)]
         cost = float(np.mean([_robust_cost(pull, scale) for pull in pulls]))
         if landmarks is not None:
-            pulls.append(_landmark_pull(vertices, *landmarks))
+            pulls.append(
+                _held(vertices, landmarks[0][:, None], np.ones((len(landmarks[0]), 1)), landmarks[1])
+            )
+        pulls += [
+            _held(vertices, *digit_guide().rings(limb, len(vertices)), middles)
+            for limb, middles in (digits.middles.items() if digits is not None else ())
+            if limb.endswith("Hand")
+        ]
         step = _step(model, pose, start, vertices, joints, derivative, pulls, ends)
         pose = model.moved_by(pose, step)
     vertices, _ = model.evaluate(pose)
@@ -116,18 +130,23 @@ def _robust_cost(pull: _Pull, scale: float) -> float:
 
 
 def _pulls(
-    model: BodyModel, surface: Surface, vertices: np.ndarray, chosen: np.ndarray, scale: float
+    model: BodyModel,
+    surface: Surface,
+    vertices: np.ndarray,
+    chosen: np.ndarray,
+    scale: float,
+    labels: np.ndarray | None,
 ) -> Iterator[_Pull]:
-    own = Surface(vertices, model.triangles)
+    own = Surface(vertices, model.triangles, labels=labels)
     ids = model.skin
-    there = surface.facing(vertices[ids], own.normals[ids])
+    there = surface.facing(vertices[ids], own.normals[ids], None if labels is None else labels[ids])
     yield _Pull(
         vertices=np.repeat(ids[:, None], 3, 1), shares=np.tile([1.0, 0.0, 0.0], (len(ids), 1)),
         points=vertices[ids], targets=there.points, normals=there.normals,
         weights=~there.open * _weights(vertices[ids], there.points, own.normals[ids], there.normals, scale),
     )  # fmt: skip
     points, normals = surface.vertices[chosen], surface.normals[chosen]
-    here = own.facing(points, normals)
+    here = own.facing(points, normals, None if surface.labels is None else surface.labels[chosen])
     weights = _weights(here.points, points, here.normals, normals, scale)
     yield _Pull(
         vertices=model.triangles[here.faces], shares=here.shares, points=here.points,
@@ -143,13 +162,13 @@ def _weights(
     return agree * (scale**2 / (squared + scale**2)) ** 2
 
 
-def _landmark_pull(vertices: np.ndarray, ids: np.ndarray, targets: np.ndarray) -> _Pull:
-    """Landmarks, three times with one axis each as the normal."""
+def _held(vertices: np.ndarray, ids: np.ndarray, shares: np.ndarray, targets: np.ndarray) -> _Pull:
+    """Combinations (m, k) of vertices held at targets (m, 3): thrice, with one axis each as the normal."""
     axes = np.repeat(np.eye(3), len(ids), 0)
-    ids, targets = np.tile(ids, 3), np.tile(targets, (3, 1))
+    points = np.einsum("mk,mkc->mc", shares, vertices[ids])
     return _Pull(
-        vertices=np.repeat(ids[:, None], 3, 1), shares=np.tile([1.0, 0.0, 0.0], (len(ids), 1)),
-        points=vertices[ids], targets=targets, normals=axes, weights=np.full(len(ids), 30.0),
+        vertices=np.tile(ids, (3, 1)), shares=np.tile(shares, (3, 1)), points=np.tile(points, (3, 1)),
+        targets=np.tile(targets, (3, 1)), normals=axes, weights=np.full(len(axes), _HOLD),
     )  # fmt: skip
 
 

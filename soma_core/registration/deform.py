@@ -35,20 +35,25 @@ class Smoothness:
 
     Attributes:
         triangles: (t, 3).
+        labels: (v, 5) fingers and toes, where they are known on the surface too.
         laplacian: (v, v), identity less the mean of the neighbours.
         energy: (v, v), its normal matrix.
     """
 
     triangles: np.ndarray
+    labels: np.ndarray
     laplacian: scipy.sparse.csr_array
     energy: scipy.sparse.csr_array
 
     @classmethod
-    def of(cls, triangles: np.ndarray, count: int) -> Smoothness:
-        """Build it from the triangles of a mesh of `count` vertices."""
+    def of(cls, triangles: np.ndarray, labels: np.ndarray) -> Smoothness:
+        """Build it from the triangles of a mesh with a label for each vertex."""
+        count = len(labels)
         edges = unique_edges(triangle_sides(triangles)).astype(np.int32)  # and so the matrices' indices
         laplacian = random_walk(edges, count)
-        return cls(triangles=triangles, laplacian=laplacian, energy=(laplacian.T @ laplacian).tocsr())
+        return cls(
+            triangles=triangles, labels=labels, laplacian=laplacian, energy=(laplacian.T @ laplacian).tocsr()
+        )
 
 
 def deform(
@@ -79,11 +84,11 @@ def deform(
     vertices, count = start if begin is None else begin, len(start)
     trust = np.ones(count) if trust is None else trust
     for reach in reaches:
-        weights, targets = _forward(vertices, surface, smooth.triangles, free, scale)
+        weights, targets = _forward(vertices, surface, smooth, free, scale)
         weights = weights * trust
         matrix = scipy.sparse.diags_array(weights) + reach**4 * smooth.energy
         right = weights[:, None] * (targets - start)
-        pull, wanted, held = _backward(vertices, surface, smooth.triangles, free, scale)
+        pull, wanted, held = _backward(vertices, surface, smooth, free, scale)
         held = _BACKWARD * held * (pull @ trust) * min(1.0, count / max(len(held), 1))
         matrix = matrix + pull.T @ scipy.sparse.diags_array(held) @ pull
         right += pull.T @ (held[:, None] * (wanted - pull @ start))
@@ -100,11 +105,11 @@ def deform(
 
 
 def _forward(
-    vertices: np.ndarray, surface: Surface, triangles: np.ndarray, free: np.ndarray, scale: float
+    vertices: np.ndarray, surface: Surface, smooth: Smoothness, free: np.ndarray, scale: float
 ) -> tuple[np.ndarray, np.ndarray]:
     """Weights (v,) and targets (v, 3) of the vertices themselves."""
-    normals = vertex_normals(vertices, triangles)
-    contact = surface.facing(vertices, normals)
+    normals = vertex_normals(vertices, smooth.triangles)
+    contact = surface.facing(vertices, normals, smooth.labels)
     offset = contact.points - vertices
     along = (offset * contact.normals).sum(1)
     weights = _agreement(offset, normals, contact.normals, scale)
@@ -113,15 +118,16 @@ def _forward(
 
 
 def _backward(
-    vertices: np.ndarray, surface: Surface, triangles: np.ndarray, free: np.ndarray, scale: float
+    vertices: np.ndarray, surface: Surface, smooth: Smoothness, free: np.ndarray, scale: float
 ) -> tuple[scipy.sparse.csr_array, np.ndarray, np.ndarray]:
     """Matrix (m, v) of the mesh's points nearest to the surface's vertices, their targets and weights."""
-    own = Surface(vertices, triangles)
-    contact = own.facing(surface.vertices, surface.normals)
+    labels = None if surface.labels is None else smooth.labels
+    own = Surface(vertices, smooth.triangles, labels=labels)
+    contact = own.facing(surface.vertices, surface.normals, surface.labels)
     offset = surface.vertices - contact.points
     along = (offset * contact.normals).sum(1)
     weights = _agreement(offset, contact.normals, surface.normals, scale)
-    corners = triangles[contact.faces]
+    corners = smooth.triangles[contact.faces]
     weights[free[corners].any(1)] = 0
     rows = np.repeat(np.arange(len(offset)), 3)
     matrix = scipy.sparse.csr_array(
@@ -139,5 +145,5 @@ def _agreement(offset: np.ndarray, normals: np.ndarray, others: np.ndarray, scal
 def project(vertices: np.ndarray, surface: Surface, smooth: Smoothness, *, free: np.ndarray) -> np.ndarray:
     """Put vertices on faces that look the same way; those that are free or over a hole stay."""
     normals = vertex_normals(vertices, smooth.triangles)
-    contact = surface.facing(vertices, normals)
+    contact = surface.facing(vertices, normals, smooth.labels)
     return np.where((free | contact.open)[:, None], vertices, contact.points)

@@ -29,10 +29,14 @@ def face_normals(vertices: np.ndarray, triangles: np.ndarray) -> np.ndarray:
 
 
 def flipped_triangles(
-    vertices: np.ndarray, triangles: np.ndarray, surface: Surface, free: np.ndarray
+    vertices: np.ndarray,
+    triangles: np.ndarray,
+    surface: Surface,
+    free: np.ndarray,
+    labels: np.ndarray | None = None,
 ) -> np.ndarray:
     """(t,) whether a face looks the other way than the surface at its corners, none free or over a hole."""
-    contact = surface.facing(vertices, vertex_normals(vertices, triangles))
+    contact = surface.facing(vertices, vertex_normals(vertices, triangles), labels)
     against = (face_normals(vertices, triangles) * contact.normals[triangles].mean(1)).sum(1) <= 0
     return against & ~(free | contact.open)[triangles].any(1)
 
@@ -79,7 +83,7 @@ def lay_down(
     trust = np.ones(len(vertices))
     for _ in range(_ROUNDS):
         laid = project(vertices, surface, smooth, free=free | (trust < 1))
-        bad = flipped_triangles(laid, triangles, surface, free)
+        bad = flipped_triangles(laid, triangles, surface, free, smooth.labels)
         bad |= folded_triangles(laid, start, triangles) & ~free[triangles].any(1)
         if not bad.any():
             break

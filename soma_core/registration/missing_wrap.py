@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
+from soma_core.errors import InputError
 from soma_core.obj import read_obj
 from soma_core.plugin.registry import Registry, default_registry
 from soma_core.registration.native_mesh import NativeMesh, neutral_mesh
@@ -32,7 +33,7 @@ def make_missing_wrap(name: str, options: Mapping[str, Any], *, registry: Regist
         registry: where it is looked up.
 
     Raises:
-        SomaError: the mesh cannot be had, is broken, or shows no human body.
+        SomaError: the mesh cannot be had, is broken, or shows no human body; faults of the wrap.
     """
     registry = registry or default_registry()
     spec = registry.spec(name)
@@ -62,6 +63,13 @@ def make_missing_wrap(name: str, options: Mapping[str, Any], *, registry: Regist
     )
     quality = measure(found, mesh)
     write_report(pair.wrap.parent, found, quality, native=native.name)
+    if quality.faults:
+        raise InputError(
+            "the wrap that was made",
+            got="; ".join(quality.faults),
+            expected="a body that is covered, fingers one to one",
+            fix=f"Name points in a file: soma wrap backend={name} landmarks=FILE out={pair.wrap.parent}",
+        )
     write_pair(pair.wrap.parent, found, mesh, vertices=native.vertices, triangles=native.triangles,
                name=native.name, source=native.file)  # fmt: skip
     distance = quality.as_dict()["surface_distance_mm"]

@@ -1,15 +1,19 @@
-"""How good a wrap is: distances both ways, flipped faces, stretch."""
+"""How good a wrap is: distances both ways, by segment too, fingers and toes, flipped faces, stretch."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
+from soma_core.registration.coverage import Share, coverage, faults, matches
+from soma_core.registration.digits import digit_guide
 from soma_core.registration.folds import flipped_triangles
 from soma_core.registration.register import Registration
 from soma_core.registration.surface import Surface
+from soma_core.rig import load_canonical
 from soma_core.rig.mesh import CanonicalMesh
 
 __all__ = ["Quality", "measure"]
@@ -24,12 +28,20 @@ class Quality:
         uncovered: (n,) of each vertex of the native skin to the wrap.
         flipped: (t,) whether a triangle faces the other way than the skin at its three corners.
         stretch: (e,) ratio of edge lengths, wrap by canonical mesh, over its median.
+        coverage: segment -> shares of it and of the skin at it that lie on each other.
+        digits: finger or toe -> shares that lie on the same; only where those of the skin were told apart.
+        extremities: hand or foot -> how many the skin has; None where it is not apart from the rest.
+        faults: one sentence for each thing that makes the wrap unfit for use.
     """
 
     distance: np.ndarray
     uncovered: np.ndarray
     flipped: np.ndarray
     stretch: np.ndarray
+    coverage: Mapping[str, Share]
+    digits: Mapping[str, Share]
+    extremities: Mapping[str, int | None]
+    faults: tuple[str, ...]
 
     def as_dict(self) -> dict[str, Any]:
         """Numbers for a report."""
@@ -43,6 +55,10 @@ class Quality:
                 f"p{share}": round(float(np.percentile(self.stretch, share)), 3) for share in (1, 50, 99)
             },
             "filled_vertices": int(np.isnan(self.distance).sum()),
+            "coverage": {name: share.as_dict() for name, share in self.coverage.items()},
+            "digits": {name: share.as_dict() for name, share in self.digits.items()},
+            "extremities": dict(self.extremities),
+            "faults": list(self.faults),
         }
 
 
@@ -62,12 +78,20 @@ def measure(found: Registration, mesh: CanonicalMesh) -> Quality:
     contact = surface.closest(wrap)
     distance = 1000 * np.linalg.norm(contact.points - wrap, axis=1)
     own = Surface(wrap, triangles)
+    guide, (_, rig) = digit_guide(), load_canonical("mid")
+    digits = guide.find(surface, wrap)
+    covered = coverage(wrap, surface, mesh, rig, found.filled)
+    matched = matches(wrap, surface, digits, guide)
     back = 1000 * np.linalg.norm(own.closest(surface.vertices).points - surface.vertices, axis=1)
     return Quality(
         distance=np.where(found.filled, np.nan, distance),
         uncovered=back,
         flipped=flipped_triangles(wrap, triangles, surface, found.filled),
         stretch=_stretch(wrap, mesh.vertices, triangles),
+        coverage=covered,
+        digits=matched,
+        extremities=digits.counts,
+        faults=faults(covered, matched, digits.counts, told=found.told),
     )
 
 

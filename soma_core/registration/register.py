@@ -19,7 +19,9 @@ from soma_core.progress import progress
 from soma_core.registration.alignment import find_starts
 from soma_core.registration.body_fit import BodyFit, fit_body
 from soma_core.registration.body_model import BodyModel
+from soma_core.registration.coverage import without_digits
 from soma_core.registration.deform import Smoothness, deform
+from soma_core.registration.digits import Digits, Marks, digit_guide
 from soma_core.registration.folds import lay_down
 from soma_core.registration.strangers import refuse_distant, refuse_unlike
 from soma_core.registration.surface import Surface
@@ -45,6 +47,13 @@ _GRIP = ([0.03] * 3 + [0.02] * 3, 8.0)
 _SPIN, _CLEARLY = 0.3, 0.8
 """A finger's width at the fingertips [rad], and the share of the cost that makes spinning worth it."""
 
+_LOOKS = (1, 3)
+"""Stages before which fingers and toes are told apart."""
+
+_HELD, _TOLD = 3, 4
+"""Last stages in which parts of fingers are held where they belong, and in which skin keeps to its finger;
+then they lie right, and where a finger begins is better told by the surface than by a distance."""
+
 _TRIAL = 2
 """Steps after which hands and feet taken from the other side are compared."""
 
@@ -64,10 +73,6 @@ _NOTHING_LIKE = 0.04
 """The same for the rough fit, to say so early."""
 
 _ANCHOR = 1e4
-
-
-Marks = tuple[np.ndarray, np.ndarray] | None
-"""Landmarks: vertex ids (m,) and positions (m, 3)."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -104,6 +109,7 @@ class Registration:
         symmetric: whether both sides were wrapped alike.
         fitted: (v, 3) the parametric body, native unit and axes.
         notes: what was found and left out, for people.
+        told: hands and feet all whose fingers or toes have a landmark.
     """
 
     wrap: np.ndarray
@@ -113,6 +119,7 @@ class Registration:
     symmetric: bool
     fitted: np.ndarray
     notes: tuple[str, ...]
+    told: tuple[str, ...] = ()
 
 
 def register(
@@ -136,24 +143,27 @@ def register(
     coarse, fine = (BodyModel(SomaLayer("soma", lod=lod, procedural=False)) for lod in ("low", "mid"))
     marks = _landmarks(options, vertices, fine.mesh.vertex_count)
     filled = _filled(options.fill, fine.mesh)
-    fit, frame = _fit_best(skin, coarse, options, marks)
-    surface = skin.surface(frame)
+    light = skin.lighter()
+    fit, frame = _fit_best(light, coarse, options, marks)
+    surface, whole = light.surface(frame), skin.surface(frame)
     refuse_distant(fit, coarse, surface, share=_NOTHING_LIKE)
     symmetric = options.symmetric if options.symmetric is not None else _is_symmetric(surface)
-    fit = _refine(fit, coarse, surface, symmetric, _in_frame(marks, frame, coarse.mesh.vertex_count))
+    marks = _in_frame(marks, frame, fine.mesh.vertex_count)
+    fit = _refine(fit, (coarse, fine), surface, symmetric, marks)
     refuse_distant(fit, coarse, surface, share=_NOT_HUMAN)
     fitted, _ = fine.evaluate(fit.pose)
-    marks = _in_frame(marks, frame, fine.mesh.vertex_count)
-    wrap = _lay_on(fitted, surface, coarse.mesh, fine.mesh, filled, marks, symmetric)
-    filled |= surface.facing(wrap, vertex_normals(wrap, fine.triangles)).open
+    digits = digit_guide().find(surface, fitted, marks=marks)
+    wrap = _lay_on(fitted, (surface, whole), coarse.mesh, fine.mesh, filled, marks, symmetric, digits)
+    filled |= whole.facing(wrap, vertex_normals(wrap, fine.triangles)).open
     notes = (
         f"unit {frame.unit}, up {frame.up}, facing {frame.forward}",
         f"{'symmetric' if symmetric else 'not symmetric'}",
         *skin.notes,
+        *without_digits(digits.counts),
     )
     return Registration(
         wrap=frame.to_native(wrap), frame=frame, skin=skin, filled=filled, symmetric=symmetric,
-        fitted=frame.to_native(fitted), notes=notes,
+        fitted=frame.to_native(fitted), notes=notes, told=digit_guide().told(options.landmarks),
     )  # fmt: skip
 
 
@@ -194,10 +204,15 @@ def _landmarks(options: WrapOptions, vertices: np.ndarray, count: int) -> Marks:
 
 def _in_frame(marks: Marks, frame: Frame, count: int) -> Marks:
     """Marks on the first `count` vertices, in metres, +Y up."""
+    return None if marks is None else _first((marks[0], frame.to_canonical(marks[1])), count)
+
+
+def _first(marks: Marks, count: int) -> Marks:
+    """Marks on the first `count` vertices, if any."""
     if marks is None:
         return None
     kept = marks[0] < count
-    return (marks[0][kept], frame.to_canonical(marks[1][kept])) if kept.any() else None
+    return (marks[0][kept], marks[1][kept]) if kept.any() else None
 
 
 def _is_symmetric(surface: Surface) -> bool:
@@ -206,26 +221,47 @@ def _is_symmetric(surface: Surface) -> bool:
     return bool(gap.mean() < _SYMMETRIC)
 
 
-def _refine(fit: BodyFit, model: BodyModel, surface: Surface, symmetric: bool, marks: Marks) -> BodyFit:
-    """Fit in stages, from coarse to fine; of a symmetric body the better side is kept."""
+def _refine(
+    fit: BodyFit, models: tuple[BodyModel, BodyModel], surface: Surface, symmetric: bool, marks: Marks
+) -> BodyFit:
+    """Fit in stages, from coarse to fine; of a symmetric body the better side is kept.
+
+    Fingers and toes are told apart as soon as limbs are nearly in place, and again when they are.
+    """
+    model, fine = models
+    digits = None
+    low = _first(marks, model.mesh.vertex_count)
     for number, (scales, ends) in enumerate(
         progress(_STAGES, label="fitting shape and pose", total=len(_STAGES)), start=1
     ):
+        if number in _LOOKS:
+            digits = digit_guide().find(surface, fine.evaluate(fit.pose)[0], marks=marks)
+            surface = surface.labelled(digits.labels)
+        if number > _TOLD:
+            digits, surface = None, surface.labelled(None)
+        elif number > _HELD and digits is not None:
+            digits = digits.released()
         if number == len(_STAGES) - 1:
-            fit = _better_grip(fit, model, surface, symmetric, marks)
-        fit = fit_body(model, surface, fit.pose, scales=scales, ends=ends, landmarks=marks)
-        fit = _better_side(fit, model, surface, symmetric, scale=scales[-1], ends=ends)
+            fit = _better_grip(fit, model, surface, symmetric, low, digits)
+        fit = fit_body(model, surface, fit.pose, scales=scales, ends=ends, landmarks=low, digits=digits)
+        fit = _better_side(fit, model, surface, symmetric, digits, scale=scales[-1], ends=ends)
     return fit
 
 
-def _better_grip(fit: BodyFit, model: BodyModel, surface: Surface, symmetric: bool, marks: Marks) -> BodyFit:
-    """Hands whose fingers lie on the wrong neighbours are tried a finger further to either side."""
+def _better_grip(
+    fit: BodyFit, model: BodyModel, surface: Surface, symmetric: bool, marks: Marks, digits: Digits | None
+) -> BodyFit:
+    """Hands whose fingers may lie on the wrong neighbours are tried a finger further to either side."""
     scales, ends = _GRIP
+    known = () if digits is None else digits.tips
     for side in ("Left",) if symmetric else ("Left", "Right"):
+        if f"{side}Hand" in known:
+            continue
         spun = [model.spun(fit.pose, side, angle) for angle in (-_SPIN, _SPIN)]
         poses = [fit.pose, *([model.like(pose, side) for pose in spun] if symmetric else spun)]
         same, *others = (
-            fit_body(model, surface, pose, scales=scales, ends=ends, landmarks=marks) for pose in poses
+            fit_body(model, surface, pose, scales=scales, ends=ends, landmarks=marks, digits=digits)
+            for pose in poses
         )
         best = min(others, key=lambda each: each.cost)
         fit = best if best.cost < _CLEARLY * same.cost else fit
@@ -233,7 +269,14 @@ def _better_grip(fit: BodyFit, model: BodyModel, surface: Surface, symmetric: bo
 
 
 def _better_side(
-    fit: BodyFit, model: BodyModel, surface: Surface, symmetric: bool, *, scale: float, ends: float
+    fit: BodyFit,
+    model: BodyModel,
+    surface: Surface,
+    symmetric: bool,
+    digits: Digits | None,
+    *,
+    scale: float,
+    ends: float,
 ) -> BodyFit:
     """Fingers and toes that took the wrong place on one side are tried as they are on the other.
 
@@ -241,7 +284,9 @@ def _better_side(
     """
     tried = [(model.like if symmetric else model.ends_like)(fit.pose, side) for side in ("Left", "Right")]
     poses = tried if symmetric else [fit.pose, *tried]
-    steps = [fit_body(model, surface, pose, scales=[scale] * _TRIAL, ends=ends) for pose in poses]
+    steps = [
+        fit_body(model, surface, pose, scales=[scale] * _TRIAL, ends=ends, digits=digits) for pose in poses
+    ]
     best = min(range(len(poses)), key=lambda i: steps[i].cost)
     if symmetric:
         return BodyFit(pose=poses[best], vertices=model.evaluate(poses[best])[0], cost=steps[best].cost)
@@ -265,26 +310,29 @@ def _filled(names: Sequence[str], mesh: CanonicalMesh) -> np.ndarray:
 
 def _lay_on(
     fitted: np.ndarray,
-    surface: Surface,
+    surfaces: tuple[Surface, Surface],
     low: CanonicalMesh,
     mid: CanonicalMesh,
     filled: np.ndarray,
     marks: Marks,
     symmetric: bool,
+    digits: Digits,
 ) -> np.ndarray:
-    """Deform coarse to fine, project, fill."""
-    coarse = Smoothness.of(low.triangles.astype(np.int64), low.vertex_count)
-    fine = Smoothness.of(mid.triangles.astype(np.int64), mid.vertex_count)
+    """Deform coarse to fine on the first surface, fingers matched at first; project on the second, fill."""
+    surface, whole = surfaces
     count = low.vertex_count
-    low_marks = None if marks is None else (marks[0][marks[0] < count], marks[1][marks[0] < count])
+    coarse = Smoothness.of(low.triangles.astype(np.int64), digits.own[:count])
+    fine = Smoothness.of(mid.triangles.astype(np.int64), digits.own)
+    low_marks = _first(marks, count)
     start = fitted[:count]
     moved = deform(
-        start, surface, coarse, free=filled[:count], reaches=_COARSE, scale=_COARSE_SCALE, landmarks=low_marks
-    )
+        start, surface.labelled(digits.labels), coarse, free=filled[:count], reaches=_COARSE,
+        scale=_COARSE_SCALE, landmarks=low_marks,
+    )  # fmt: skip
     vertices = _both_sides(fitted + _spread(moved - start, fine), mid.mirror, symmetric)
     vertices = deform(vertices, surface, fine, free=filled, reaches=_FINE, scale=_FINE_SCALE, landmarks=marks)
     vertices = _both_sides(vertices, mid.mirror, symmetric)
-    on_skin = lay_down(vertices, fitted, surface, fine, free=filled, scale=_FINE_SCALE)
+    on_skin = lay_down(vertices, fitted, whole, fine, free=filled, scale=_FINE_SCALE)
     regions = build_fill(vertices, fine.triangles, np.flatnonzero(filled))
     fill = FillOperator(regions, dtype=torch.float64, device="cpu")
     return fill(torch.as_tensor(on_skin)).numpy()

@@ -16,6 +16,9 @@ __all__ = ["Contact", "Surface"]
 _TURN = 0.04
 """Length [m] that a unit difference of normals counts for: between the sides of a gap, the right one wins."""
 
+_OTHER = 0.1
+"""Length [m] that belonging to another finger or toe counts for."""
+
 _ON_RIM = 1e-9
 """Share of the corners off the rim below which a point lies on it."""
 
@@ -46,25 +49,47 @@ class Surface:
         vertices: (n, 3) [m].
         triangles: (t, 3), counter-clockwise seen from outside.
         rim: (n,) whether a vertex lies on the rim of a hole that a mask cut; default none.
+        labels: (n, 5) how far a vertex belongs to the fingers or toes of its limb; default not at all.
     """
 
-    def __init__(self, vertices: np.ndarray, triangles: np.ndarray, rim: np.ndarray | None = None) -> None:
+    def __init__(
+        self,
+        vertices: np.ndarray,
+        triangles: np.ndarray,
+        rim: np.ndarray | None = None,
+        labels: np.ndarray | None = None,
+    ) -> None:
         self.vertices, self.triangles = vertices, triangles
         self._rim = np.zeros(len(vertices), bool) if rim is None else rim
         self.normals = vertex_normals(vertices, triangles)
         corners = vertices[triangles]
         normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
         self.face_normals = normals / np.maximum(np.linalg.norm(normals, axis=1), 1e-300)[:, None]
-        self._tree = cKDTree(np.hstack([corners.mean(1), _TURN * self.face_normals]))
+        self.labels = labels
+        keys = [corners.mean(1), _TURN * self.face_normals]
+        if labels is not None:
+            keys.append(_OTHER * labels[triangles].mean(1))
+        self._tree = cKDTree(np.hstack(keys))
         self._exact = ClosestFaces(vertices, triangles)
 
-    def facing(self, points: np.ndarray, normals: np.ndarray) -> Contact:
-        """Closest points (m) among faces turned like `normals`: a finger does not touch its neighbour."""
-        _, proposed = self._tree.query(np.hstack([points, _TURN * normals]))
+    def facing(self, points: np.ndarray, normals: np.ndarray, labels: np.ndarray | None = None) -> Contact:
+        """Closest points (m) among faces turned like `normals`, and of the finger or toe in `labels` (m, 5).
+
+        A surface without labels takes no notice of theirs; one that has them needs them.
+        """
+        keys = [points, _TURN * normals]
+        if self.labels is not None:
+            assert labels is not None
+            keys.append(_OTHER * labels)
+        _, proposed = self._tree.query(np.hstack(keys))
         faces = self._exact.nearest_touching(points, proposed)
         moved = np.flatnonzero(faces != proposed)
         faces[moved] = self._exact.nearest_touching(points[moved], faces[moved])
         return self._contact(points, faces)
+
+    def labelled(self, labels: np.ndarray | None) -> Surface:
+        """The same surface with other labels (n, 5), or none."""
+        return Surface(self.vertices, self.triangles, self._rim, labels)
 
     def closest(self, points: np.ndarray) -> Contact:
         """Closest points (m) whatever the orientation."""

@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import scipy.sparse
 from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
 
 from soma_core.errors import InputError
 from soma_core.geometry.mesh import enclosed_volume
 from soma_core.plugin.spec import Axis, Unit
 from soma_core.registration.surface import Surface
 from soma_core.topology.frames import METRES, native_to_canonical
+
+_log = logging.getLogger(__name__)
 
 __all__ = ["Frame", "Skin", "find_skin", "find_unit"]
 
@@ -26,6 +30,12 @@ _LARGEST_PART = 0.2
 
 _OPEN = 0.02
 """Share of the edges that may lie on a border: cut wrists and eye sockets, not half a scan."""
+
+_MOST_FACES = 50_000
+"""Faces that a fit looks at; the wrap is laid on all of them."""
+
+_WORTH = 0.7
+"""Share of the faces from which on taking fewer is not worth it."""
 
 _TWISTED = 0.001
 """Share of the edges that may belong to three faces or be run through twice in one direction."""
@@ -73,6 +83,27 @@ class Skin:
     triangles: np.ndarray
     notes: tuple[str, ...] = ()
     rim: np.ndarray | None = None
+
+    def lighter(self) -> Skin:
+        """The same skin with few enough faces to be fitted to; itself where it has no more."""
+        share = _MOST_FACES / len(self.triangles)
+        if share > _WORTH:
+            return self
+        try:
+            import pyvista
+        except ImportError:
+            _log.info(
+                "%d faces are fitted as they are, which takes longer; with pyvista, fewer would be",
+                len(self.triangles),
+            )
+            return self
+        faces = np.insert(self.triangles, 0, 3, axis=1).ravel()
+        fewer = pyvista.PolyData(self.vertices, faces).decimate(1 - share)
+        vertices = np.asarray(fewer.points, np.float64)
+        nearest = cKDTree(self.vertices).query(vertices)[1]
+        rim = None if self.rim is None else self.rim[nearest]
+        triangles = fewer.faces.reshape(-1, 4)[:, 1:].astype(np.int64)
+        return Skin(vertices=vertices, triangles=triangles, rim=rim)
 
     def surface(self, frame: Frame) -> Surface:
         """The skin in metres, +Y up, +Z forward."""

@@ -1,4 +1,4 @@
-"""Check the assets, tell what a folder of them holds, choose one (`soma assets`)."""
+"""Check the assets, tell what a folder of them holds, choose one, list named points (`soma assets`)."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from pathlib import Path
 from soma_core.cache import atomic_text
 from soma_core.errors import AssetError, SomaError
 from soma_core.paths import assets_dir, assets_note, expanded, model_folders, shipped_assets
+from soma_core.rig.landmarks import canonical_landmarks
 from soma_core.rig.manifest import (
     CORRECTIVES_NAME,
     MANIFEST_NAME,
@@ -23,7 +24,7 @@ from soma_core.rig.manifest import (
     verified_sha256,
 )
 
-__all__ = ["show_assets", "use_assets", "verify_assets"]
+__all__ = ["list_landmarks", "show_assets", "use_assets", "verify_assets"]
 
 _PUBLISHED = "https://huggingface.co/nvidia/soma-x"
 _MODELS = ("Anny", "GarmentMeasurements", "MHR", "SMPL", "SMPLX")
@@ -244,3 +245,12 @@ def _model_lines() -> list[str]:
         )
         lines.append(f"backend      {entry.name}: {state} ({spec.licence})")
     return lines
+
+
+def list_landmarks(picture: Path | None = None) -> str:
+    """Names and vertex ids of the canonical landmarks, one a line; drawn into a PNG where one is named."""
+    if picture is not None:
+        from soma_core.view.landmark_picture import draw_landmarks
+
+        draw_landmarks(picture)
+    return "\n".join(f"{number:>5}  {name}" for name, number in canonical_landmarks().items())

@@ -9,10 +9,11 @@ from typing import TYPE_CHECKING, Any
 
 from omegaconf import OmegaConf
 
-from soma_core.errors import AssetError, InputError
+from soma_core.errors import AssetError, InputError, SomaError
 from soma_core.json_file import read_json
 from soma_core.options import BackendChoice
 from soma_core.paths import expanded
+from soma_core.plugin.declaration import did_you_mean
 from soma_core.plugin.registry import default_registry
 from soma_core.plugin.spec import WrapPair
 from soma_core.registration.native_mesh import NativeMesh, neutral_mesh, read_native_mesh
@@ -20,6 +21,7 @@ from soma_core.registration.pair_files import write_pair, write_report
 from soma_core.registration.quality import Quality, measure
 from soma_core.registration.register import Registration, WrapOptions, register
 from soma_core.rig import load_canonical
+from soma_core.rig.landmarks import canonical_landmarks
 
 if TYPE_CHECKING:
     from omegaconf import DictConfig
@@ -31,11 +33,12 @@ _log = logging.getLogger(__name__)
 _AXES = ("+x", "-x", "+y", "-y", "+z", "-z")
 
 
-def run(config: DictConfig, output: Path) -> None:
-    """Register the canonical mesh; write the pair, ``report.json`` and ``wrap.png``.
+def run(config: DictConfig, output: Path) -> Path:
+    """Register the canonical mesh; write the pair, ``report.json`` and ``wrap.png``; return their folder.
 
     Raises:
-        SomaError: the mesh cannot be read, is broken, or shows no human body.
+        SomaError: the mesh cannot be read, is broken, or shows no human body; or a part of it is not covered,
+            or a finger lies on another one, once all is written.
     """
     mesh, _ = load_canonical("mid")
     folder = expanded(config.out) if config.out else output
@@ -54,6 +57,18 @@ def run(config: DictConfig, output: Path) -> None:
         from soma_core.view.wrap_picture import draw_wrap
 
         draw_wrap(folder / "wrap.png", found, quality, mesh)
+    if quality.faults:
+        raise SomaError(_refusal(folder, quality, picture=config.picture))
+    return folder
+
+
+def _refusal(folder: Path, quality: Quality, *, picture: bool) -> str:
+    shown = folder / ("wrap.png" if picture else "report.json")
+    return (
+        f"{folder}: this wrap is not fit for use. {'; '.join(quality.faults)}. Look at {shown}; then name "
+        'points in landmarks=FILE, JSON such as {"LeftIndexTip": 1234} (soma assets landmarks lists the '
+        "names), or what is no skin in mask=FILE."
+    )
 
 
 def _say(found: Registration, quality: Quality, pair: WrapPair, fill: Sequence[str]) -> None:
@@ -114,23 +129,34 @@ def _options(config: DictConfig, native: NativeMesh) -> WrapOptions:
 
 
 def read_landmarks(name: str | Path) -> dict[int, int]:
-    """Canonical vertex id -> native vertex id, of a JSON file.
+    """Canonical vertex id -> native vertex id, of a JSON file whose keys are ids or names of landmarks.
 
     Raises:
         AssetError: missing, or something else.
+        InputError: an unknown name.
     """
-    found = _json(name, dict, '{"canonical vertex id": native vertex id}')
-    return {int(key): int(value) for key, value in found.items()}
+    expected = '{"LeftIndexTip or a canonical vertex id": native vertex id}'
+    found = _json(name, dict, expected)
+    names = canonical_landmarks()
+    unknown = [key for key in found if key not in names and not key.isdecimal()]
+    if unknown:
+        raise InputError(
+            "landmarks",
+            got=unknown[0],
+            expected="a canonical vertex id or a name that soma assets landmarks lists",
+            fix=did_you_mean(unknown[0], list(names)) or "Correct the name.",
+        )
+    return {names[key] if key in names else int(key): int(value) for key, value in found.items()}
 
 
 def _json(name: str | Path | None, kind: type, expected: str) -> Any:
-    """Content of a JSON file of integers, empty where none is named."""
+    """Content of a JSON file of integers, empty where none is named; keys may be anything."""
     if name is None:
         return kind()
     path = expanded(name)
     content = read_json(path, fix=f"Write {expected} as JSON.")
     try:
-        items = [*content, *content.values()] if isinstance(content, dict) else content
+        items = content.values() if isinstance(content, dict) else content
         whole = isinstance(content, kind) and all(int(item) == float(item) for item in items)
     except (ValueError, TypeError, OverflowError):
         whole = False

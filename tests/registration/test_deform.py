@@ -17,7 +17,7 @@ NEAR_SURFACE_MM = 1.0  # before projection; the ball is 20 mm larger than where 
 def _ball() -> tuple[Surface, np.ndarray, Smoothness]:
     vertices, triangles = sphere(16, size=BALL_M)
     target = Surface(*sphere(30, size=BALL_M + 0.02))
-    return target, vertices, Smoothness.of(triangles, len(vertices))
+    return target, vertices, Smoothness.of(triangles, np.zeros((len(vertices), 5)))
 
 
 def test_a_mesh_comes_to_lie_on_the_surface() -> None:

@@ -13,7 +13,7 @@ import torch
 import soma_core.cli
 from soma_core.errors import InputError
 from soma_core.native import NativeTransfer
-from soma_core.obj import read_obj
+from soma_core.obj import read_obj, write_obj
 from soma_core.plugin.errors import BackendError
 from soma_core.plugin.hookspecs import hookimpl
 from soma_core.plugin.registry import Registry
@@ -101,11 +101,26 @@ def test_it_is_made_once_and_said_before(tmp_path, registered, caplog):
 def test_a_native_mesh_that_is_there_is_the_one_that_is_wrapped(tmp_path, registered):
     registry = made_of(tmp_path)
     native = tmp_path / "base_body.obj"
-    native.write_text("v 0 0 0\nv 100 0 0\nv 0 170 0\nf 1 2 3\n")
+    mesh = load_canonical("mid")[0]
+    write_obj(native, 100 * mesh.vertices, mesh.triangles)
+    native.write_text("# made by hand\n" + native.read_text())
     with registry.making_wraps(maker(registry)):
         registry.generator("good", **KIND)
+    assert native.read_text().startswith("# made by hand\n")
+
+
+def test_a_wrap_with_faults_is_not_kept(tmp_path, registered):
+    registry = made_of(tmp_path)
+    (tmp_path / "base_body.obj").write_text("v 0 0 0\nv 100 0 0\nv 0 170 0\nf 1 2 3\n")
+    with (
+        registry.making_wraps(maker(registry)),
+        pytest.raises(
+            BackendError, match=r"the wrap that was made: got torso: \d+% is off the mesh.*landmarks=FILE"
+        ),
+    ):
+        registry.generator("good", **KIND)
     assert len(registered[0][0]) == 3
-    assert native.read_text().startswith("v 0 0 0\n")
+    assert not (tmp_path / "SOMA_wrap.obj").exists()
 
 
 def test_a_transfer_makes_it_as_well(tmp_path, registered):

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import re
+from dataclasses import fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -10,17 +12,20 @@ import pytest
 import torch
 from omegaconf import DictConfig, OmegaConf
 
-from soma_core.cli import EXIT_USAGE, main
+from soma_core.cli import EXIT_FAILED, EXIT_OK, EXIT_USAGE, main
 from soma_core.config.schema import WrapConfig
 from soma_core.errors import AssetError, InputError
 from soma_core.obj import read_obj
 from soma_core.plugin.hookspecs import hookimpl
 from soma_core.plugin.registry import Registry
 from soma_core.plugin.spec import Parameter, WrapPair
+from soma_core.registration.digits import digit_guide
 from soma_core.registration.pair_files import WRAP_FILE
+from soma_core.registration.quality import Quality, measure
 from soma_core.registration.register import Registration, WrapOptions
 from soma_core.registration.target import Frame, Skin
 from soma_core.rig import load_canonical
+from soma_core.rig.landmarks import canonical_landmarks
 from soma_core.rig.mesh import CanonicalMesh
 from soma_core.tasks import wrap
 from soma_core.topology.correspondence import load_correspondence
@@ -40,26 +45,38 @@ def mesh() -> CanonicalMesh:
     return load_canonical("mid")[0]
 
 
+def on_itself(vertices: np.ndarray, triangles: np.ndarray) -> Registration:
+    mesh, _ = load_canonical("mid")
+    filled = np.zeros(mesh.vertex_count, bool)
+    filled[mesh.face_interior] = True
+    return Registration(
+        wrap=mesh.vertices.copy(),
+        frame=Frame(unit="m", up="+y", forward="+z", centre=CENTRE),
+        skin=Skin(vertices=vertices, triangles=triangles),
+        filled=filled,
+        symmetric=True,
+        fitted=mesh.vertices,
+        notes=("unit m, up +y, facing +z",),
+    )
+
+
+@pytest.fixture(scope="module")
+def quality(mesh: CanonicalMesh) -> Quality:
+    """Of the canonical mesh on itself: measuring takes seconds."""
+    return measure(on_itself(mesh.vertices, mesh.triangles.astype(np.int64)), mesh)
+
+
 @pytest.fixture
-def seen(monkeypatch: pytest.MonkeyPatch, mesh: CanonicalMesh) -> list[WrapOptions]:
+def seen(monkeypatch: pytest.MonkeyPatch, quality: Quality) -> list[WrapOptions]:
     """The registration finds the canonical mesh on itself; the options that it got."""
     got: list[WrapOptions] = []
 
     def found(vertices: np.ndarray, triangles: np.ndarray, *, options: WrapOptions) -> Registration:
         got.append(options)
-        filled = np.zeros(mesh.vertex_count, bool)
-        filled[mesh.face_interior] = True
-        return Registration(
-            wrap=mesh.vertices.copy(),
-            frame=Frame(unit="m", up="+y", forward="+z", centre=CENTRE),
-            skin=Skin(vertices=vertices, triangles=triangles),
-            filled=filled,
-            symmetric=True,
-            fitted=mesh.vertices,
-            notes=("unit m, up +y, facing +z",),
-        )
+        return on_itself(vertices, triangles)
 
     monkeypatch.setattr(wrap, "register", found)
+    monkeypatch.setattr(wrap, "measure", lambda *_: quality)
     return got
 
 
@@ -75,8 +92,8 @@ def body(tmp_path: Path, mesh: CanonicalMesh) -> Path:
 def test_the_pair_is_ready_for_a_plugin(
     tmp_path: Path, body: Path, mesh: CanonicalMesh, seen: list[WrapOptions]
 ) -> None:
-    wrap.run(configured(native=str(body), out=str(tmp_path / "pair")), tmp_path / "run")
     folder = tmp_path / "pair"
+    assert wrap.run(configured(native=str(body), out=str(folder)), tmp_path / "run") == folder
     assert (folder / "body.obj").read_bytes() == body.read_bytes()
     vertices, _ = read_obj(folder / WRAP_FILE)
     assert 1000 * np.abs(vertices - mesh.vertices).max() < ROUNDING_MM
@@ -88,6 +105,9 @@ def test_the_pair_is_ready_for_a_plugin(
     assert report["flipped_percent"] < FLIPPED_PERCENT
     assert (report["unit"], report["up"], report["forward"]) == ("m", "+y", "+z")
     assert report["filled_vertices"] == len(mesh.face_interior)
+    assert report["extremities"] == dict.fromkeys(("LeftHand", "RightHand", "LeftFoot", "RightFoot"), 5)
+    assert len(report["digits"]) == 20
+    assert report["faults"] == []
 
 
 def test_the_wrap_carries_the_uvs(tmp_path: Path, body: Path, mesh: CanonicalMesh, seen) -> None:
@@ -118,7 +138,7 @@ def test_a_mesh_with_the_name_of_the_wrap_keeps_out_of_its_way(tmp_path: Path, b
 
 
 def test_what_the_user_knows_is_passed_on(tmp_path: Path, body: Path, seen: list[WrapOptions]) -> None:
-    (tmp_path / "marks.json").write_text('{"12": 34}', encoding="utf-8")
+    (tmp_path / "marks.json").write_text('{"12": 34, "LeftIndexTip": 56}', encoding="utf-8")
     (tmp_path / "mask.json").write_text("[5, 6]", encoding="utf-8")
     given = {"landmarks": str(tmp_path / "marks.json"), "mask": str(tmp_path / "mask.json")}
     known = {"unit": "cm", "up": "+z", "forward": "-y", "symmetric": False, "fill": ["eye_bags"]}
@@ -130,7 +150,7 @@ def test_what_the_user_knows_is_passed_on(tmp_path: Path, body: Path, seen: list
         forward="-y",
         symmetric=False,
         fill=("eye_bags",),
-        landmarks={12: 34},
+        landmarks={12: 34, canonical_landmarks()["LeftIndexTip"]: 56},
         masked=[5, 6],
     )
 
@@ -216,6 +236,49 @@ def test_a_ply_without_faces_is_refused(tmp_path: Path, seen) -> None:
     )
     with pytest.raises(AssetError, match="points.ply: holds no faces"):
         wrap.run(configured(native=str(path)), tmp_path)
+
+
+def test_a_finger_on_its_neighbour_is_exit_code_1(
+    tmp_path: Path, mesh: CanonicalMesh, body: Path, seen, monkeypatch: pytest.MonkeyPatch, capsys
+) -> None:
+    """The mesh is given with its left ring finger where the pinky is, as a wrap that went wrong sees it."""
+    ring, pinky = (digit_guide().along["LeftHand"][digit] > 0 for digit in (3, 4))
+    right = wrap.register
+
+    def wrong(*mesh_and_faces: np.ndarray, options: WrapOptions) -> Registration:
+        found = right(*mesh_and_faces, options=options)
+        moved = found.wrap.copy()
+        moved[ring] += moved[pinky].mean(0) - moved[ring].mean(0)
+        return replace(found, wrap=moved)
+
+    monkeypatch.setattr(wrap, "register", wrong)
+    monkeypatch.setattr(wrap, "measure", measure)
+    monkeypatch.chdir(tmp_path)
+    assert main(["wrap", f"native={body}", "out=pair", "picture=false"]) == EXIT_FAILED
+    said = capsys.readouterr().err
+    assert "pair: this wrap is not fit for use. LeftRing: " in said
+    assert "landmarks=FILE" in said
+    assert (tmp_path / "pair" / WRAP_FILE).is_file()
+
+
+def test_the_last_line_is_where_the_pair_is(tmp_path: Path, body: Path, seen, monkeypatch, capsys) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert main(["wrap", f"native={body}", "out=pair", "picture=false"]) == EXIT_OK
+    assert capsys.readouterr().out.splitlines()[-1] == "pair"
+
+
+def test_an_unknown_landmark_is_refused(tmp_path: Path, body: Path, seen) -> None:
+    (tmp_path / "marks.json").write_text('{"LeftIndexTop": 34}', encoding="utf-8")
+    with pytest.raises(InputError, match="landmarks: got LeftIndexTop, expected .*LeftIndexTip"):
+        wrap.run(configured(native=str(body), landmarks=str(tmp_path / "marks.json")), tmp_path)
+
+
+def test_help_says_what_every_key_means(capsys) -> None:
+    with pytest.raises(SystemExit):
+        main(["wrap", "--help"])
+    said = capsys.readouterr().out.partition("What keys mean:")[2]
+    for key in fields(WrapConfig):
+        assert re.search(rf"^  {key.name} +\S", said, re.MULTILINE), key.name
 
 
 def test_the_picture_is_drawn(tmp_path: Path, body: Path, seen) -> None:

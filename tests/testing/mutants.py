@@ -95,6 +95,12 @@ def _pull_one_off(vertices: np.ndarray, triangles: np.ndarray) -> None:
     vertices[np.abs(vertices - [0, -13, 110]).sum(1).argmin(), 1] -= 9
 
 
+def _short_arm(vertices: np.ndarray, triangles: np.ndarray) -> None:
+    """Draw the end of an arm of the wrap back into it: the skin there is bare."""
+    end = vertices[:, 0].max()
+    vertices[:, 0] = np.minimum(vertices[:, 0], end - 6)
+
+
 def _brim(vertices: np.ndarray, triangles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Put a hat with a brim of 20 cm on the native head; the wrap does not follow it."""
     angle = np.linspace(0, 2 * np.pi, 60, endpoint=False)
@@ -244,6 +250,11 @@ MUTANTS = (
         r"canonical vertex \d+: got \d+ mm to the native surface, and 0.1% of",
         lambda made: made.remesh("wrap.obj", _pull_one_off),
     ),
+    Mutant(
+        "wrap-coverage",
+        r"wrap .*wrap.obj, Left\w+: got \d+% of it on the native surface, and \d+% of that under it",
+        lambda made: made.remesh("wrap.obj", _short_arm),
+    ),
     Mutant("generator-builds", r"_generator.py:\d+: got ZeroDivisionError", _before_rest("1 / 0")),
     Mutant(
         "generator-builds", r"_generator.py:\d+: got SystemExit: bye", _before_rest("raise SystemExit('bye')")
@@ -362,8 +373,8 @@ MUTANTS = (
         "stature", r"random body \d: got a stature of", _in(_GENERATOR, "size.log()", "(30 * size.log())")
     ),
     Mutant(
-        "transfer-neutral",
-        r"native vertex \d+ of the default body: got \d+ mm to the transferred body",
+        "wrap-coverage",
+        r"native mesh .*native.obj, around \[.*\] m: got \d+.\d% of the body's diagonal from the wrap",
         lambda made: made.remesh("native.obj", _brim),
     ),
     Mutant(

@@ -17,9 +17,9 @@ def _label(mutant: Mutant) -> str:
 
 def test_the_specimen_passes_every_check(tmp_path):
     report = check_package(tmp_path)
-    assert {
-        outcome.check.id: outcome.sentence for outcome in report.outcomes if outcome.state != "passed"
-    } == {}
+    assert {outcome.check.id: outcome.state for outcome in report.outcomes if outcome.state != "passed"} == {
+        "wrap-fingers": "not applicable"
+    }  # its hands are not the shipped ones
     assert [outcome.check.id for outcome in report.outcomes] == [
         *(check.id for check in CORE_CHECKS),
         "specimen/taller",
@@ -38,4 +38,5 @@ def test_a_mutant_fails_its_check_and_no_other(tmp_path, mutant):
 
 
 def test_no_check_is_without_a_mutant():
-    assert {check.id for check in CORE_CHECKS} == {mutant.check for mutant in MUTANTS}
+    wanted = {check.id for check in CORE_CHECKS} - {"wrap-fingers"}  # see tests/registration/test_digits.py
+    assert wanted == {mutant.check for mutant in MUTANTS}

@@ -21,7 +21,8 @@ from tests.testing.packages import check_package, package
 IDS = [
     "declares", "licence", "described", "parameter-defaults", "options", "fill-segments", "files-named",
     "own-checks", "import-light", "import-silent", "config-composes", "config-complete", "wrap-reads",
-    "wrap-count", "wrap-order", "wrap-faces", "wrap-distance", "generator-builds", "generator-shape",
+    "wrap-count", "wrap-order", "wrap-faces", "wrap-distance", "wrap-coverage", "wrap-fingers",
+    "generator-builds", "generator-shape",
     "generator-dtype", "generator-device", "finite", "deterministic", "batch-invariant", "inputs-unchanged",
     "no-global-state", "parameters", "group-defaults", "gradient", "neutral-equals-obj", "linear-basis",
     "upright", "stature", "transfer-neutral", "transfer-random", "similarity-equivariant", "joints-inside",
@@ -95,7 +96,7 @@ def test_level_core_leaves_the_slow_checks_out(tmp_path):
 
 
 def test_only_names_checks_and_brings_what_they_need(tmp_path):
-    report = check_package(tmp_path, only=["wrap-f*", "licence"])
+    report = check_package(tmp_path, only=["wrap-fa*", "licence"])
     assert list(states(report)) == [
         "declares",
         "licence",

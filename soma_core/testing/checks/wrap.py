@@ -5,6 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from soma_core.plugin.checks import CheckFailedError, check
+from soma_core.registration.coverage import COVERED, coverage, faults, matches
+from soma_core.registration.digits import digit_guide
+from soma_core.registration.surface import Surface
 from soma_core.testing.context import Context
 from soma_core.topology.wrap_pair import check_count, check_faces, check_order
 
@@ -20,6 +23,9 @@ _ASTRAY = 0.01
 """Part of the covered vertices that need not be close; nails, lips and armpits rarely are."""
 _LOOSE = 0.025
 """What no covered vertex may exceed, relative to the diagonal: 5 cm of 2 m is another part of the body."""
+
+_APART = 0.05
+"""What no native vertex may exceed, relative to the diagonal: 10 cm of 2 m is a limb, a hat or a tail."""
 
 
 def _no_wrap(context: Context) -> str:
@@ -86,4 +92,58 @@ def wrap_distance(context: Context) -> None:
         )
 
 
-CHECKS = (wrap_reads, wrap_count, wrap_order, wrap_faces, wrap_distance)
+def _skin(context: Context) -> tuple[np.ndarray, Surface]:
+    """Wrap and native surface in metres, +Y up; vertices without a face are no skin."""
+    triangles = context.wrap.native_triangles
+    used, place = np.unique(triangles, return_inverse=True)
+    native = context.wrap.native[used] @ context.wrap_frame.T
+    return context.wrap.vertices @ context.wrap_frame.T, Surface(native, place.reshape(-1, 3))
+
+
+@check("wrap-coverage", level="core", needs=("wrap-distance",), unless=_no_wrap)
+def wrap_coverage(context: Context) -> None:
+    """Each segment of the wrap lies on the native surface, and what is native there under it."""
+    wrap, surface = _skin(context)
+    back = Surface(wrap, context.mesh.triangles.astype(np.int64)).closest(surface.vertices).points
+    away = np.linalg.norm(back - surface.vertices, axis=1) / np.linalg.norm(np.ptp(wrap, axis=0))
+    if away.max() > _APART:
+        raise CheckFailedError(
+            f"native mesh {context.wrap.native_path}, around {surface.vertices[away.argmax()].round(2)} m",
+            got=f"{away.max():.1%} of the body's diagonal from the wrap",
+            expected=f"at most {_APART:.0%}",
+            fix="The wrap misses this part: register it there, or take the part out of the native OBJ.",
+        )
+    found = coverage(wrap, surface, context.mesh, context.rig, ~context.covered)
+    worst = min(found, key=lambda name: found[name].least)
+    if found[worst].least < COVERED:
+        share = found[worst]
+        raise CheckFailedError(
+            f"wrap {context.wrap.path}, {worst}",
+            got=f"{share.wrap:.0%} of it on the native surface, and {share.native:.0%} of that under it",
+            expected=f"at least {COVERED:.0%} both ways",
+            fix="Register the wrap there again, or name the segment in fill_segments if the model lacks it.",
+        )
+
+
+def _no_fingers(context: Context) -> str:
+    if context.mesh.revision != digit_guide().mesh.revision:
+        return "the canonical mesh is not the shipped one"
+    return _no_wrap(context)
+
+
+@check("wrap-fingers", level="core", needs=("wrap-distance",), unless=_no_fingers)
+def wrap_fingers(context: Context) -> None:
+    """Each finger and toe of the wrap lies on one of the native surface, in their order."""
+    wrap, surface = _skin(context)
+    digits = digit_guide().find(surface, wrap)
+    found = faults({}, matches(wrap, surface, digits, digit_guide()), dict(digits.counts), told=digits.counts)
+    if found:
+        raise CheckFailedError(
+            f"wrap {context.wrap.path}",
+            got="; ".join(found),
+            expected="fingers and toes one to one, where those of the native surface stand apart",
+            fix="Register the hand or foot again; soma wrap matches them one to one.",
+        )
+
+
+CHECKS = (wrap_reads, wrap_count, wrap_order, wrap_faces, wrap_distance, wrap_coverage, wrap_fingers)

@@ -1,0 +1,195 @@
+"""Whether a wrap covers a body, part by part and both ways, and each finger and toe one of the body's."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from soma_core.geometry.mesh import triangle_sides, vertex_normals
+from soma_core.registration.digits import DIGITS, LIMBS, DigitGuide, Digits
+from soma_core.registration.surface import Surface
+from soma_core.rig.mesh import CanonicalMesh
+from soma_core.rig.skeleton import Rig
+
+__all__ = ["COVERED", "MATCHED", "Share", "coverage", "faults", "matches", "without_digits"]
+
+_NEAR = 0.0025
+"""Distance between wrap and skin, of the body's diagonal, up to which they lie on each other: 5 mm of 2 m.
+A coarse wrap stands off a round body by up to half an edge."""
+
+COVERED = 0.9
+"""Share of a segment that lies on the other surface, either way; nostrils, lips and the skin between fingers
+do not."""
+
+MATCHED = 0.8
+"""Share of a finger that lies on one and the same finger, either way; of two that touch, seams may not."""
+
+_MITTEN = 2
+"""Extremities up to which a hand has no fingers: a mitten with its thumb, a fist with two knuckles."""
+
+_OUTER = 0.3
+"""Share of a digit's length from its base that may lie on its neighbour: where fingers begin is not sharp."""
+
+_SEGMENTS = (
+    ("head", "Head|Neck|Jaw|Eye"),
+    (r"\1\2", "(Left|Right)Hand(Thumb|Index|Middle|Ring|Pinky).*"),
+    (r"\1Hand", "(Left|Right)Hand"),
+    (r"\1Foot", "(Left|Right)(Foot|Toe).*"),
+    (r"\1Leg", "(Left|Right)(Leg|Shin|UpLeg).*"),
+    (r"\1Arm", "(Left|Right)(Arm|ForeArm|Shoulder).*"),
+    ("torso", ".*"),
+)
+"""Names of segments, and the joints whose skin they are; the first that fits."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Share:
+    """How much of two things lies on each other, 0 to 1.
+
+    Attributes:
+        wrap: of the wrap's part, on the native one.
+        native: of the native part, on the wrap's.
+    """
+
+    wrap: float
+    native: float
+
+    @property
+    def least(self) -> float:
+        """The worse way."""
+        return min(self.wrap, self.native)
+
+    def as_dict(self) -> dict[str, float]:
+        """Numbers for a report."""
+        return {"wrap": round(self.wrap, 4), "native": round(self.native, 4)}
+
+
+def _segments(rig: Rig) -> tuple[list[str], np.ndarray]:
+    """Names of the segments of a body, and the place in them of each vertex, (v,)."""
+    names = []
+    for joint in rig.joint_names:
+        name, pattern = next(pair for pair in _SEGMENTS if re.fullmatch(pair[1], joint))
+        names.append(re.sub(f"^{pattern}$", name, joint))
+    known = list(dict.fromkeys(names))
+    places = np.array([known.index(name) for name in names])
+    return known, places[np.asarray(rig.weights.argmax(1)).ravel()]
+
+
+def coverage(
+    wrap: np.ndarray, surface: Surface, mesh: CanonicalMesh, rig: Rig, filled: np.ndarray
+) -> dict[str, Share]:
+    """How much of each segment lies on the native skin and how much of that on the wrap.
+
+    Args:
+        wrap: (v, 3) [m].
+        surface: the native skin [m].
+        mesh, rig: canonical.
+        filled: (v,) vertices that do not count, nor what is nearest to them.
+    """
+    triangles = mesh.triangles.astype(np.int64)
+    sides = np.linalg.norm(np.diff(wrap[triangle_sides(triangles)], axis=1)[:, 0], axis=1)
+    near = max(_NEAR * np.linalg.norm(np.ptp(wrap, axis=0)), float(np.median(sides)) / 2)
+    names, place = _segments(rig)
+    contact = surface.closest(wrap)
+    along = (contact.normals * vertex_normals(wrap, triangles)).sum(1) > 0
+    on = (np.linalg.norm(contact.points - wrap, axis=1) <= near) & along
+    counted = ~(filled | contact.open)
+    back = Surface(wrap, triangles).closest(surface.vertices)
+    under = np.linalg.norm(back.points - surface.vertices, axis=1) <= near
+    corners = triangles[back.faces]
+    part = place[np.take_along_axis(corners, back.shares.argmax(1)[:, None], 1)[:, 0]]
+    seen = ~filled[corners].any(1)
+    return {
+        name: Share(wrap=_mean(on[counted & (place == i)]), native=_mean(under[seen & (part == i)]))
+        for i, name in enumerate(names)
+        if (counted & (place == i)).any()
+    }
+
+
+def _mean(values: np.ndarray) -> float:
+    return float(values.mean()) if len(values) else 1.0
+
+
+def _digit_name(limb: str, digit: int) -> str:
+    """``LeftIndex``, ``RightBigToe``, ..."""
+    kind = "Hand" if limb.endswith("Hand") else "Foot"
+    return limb[: -len(kind)] + DIGITS[kind][digit]
+
+
+def matches(wrap: np.ndarray, surface: Surface, digits: Digits, guide: DigitGuide) -> dict[str, Share]:
+    """How much of each finger and toe lies on the one of the skin that it was given, and the other way.
+
+    Args:
+        wrap: (v, 3) [m].
+        surface: the native skin [m].
+        digits: of that skin.
+        guide: of the canonical mesh.
+    """
+    triangles = guide.mesh.triangles.astype(np.int64)
+    there = surface.facing(wrap, vertex_normals(wrap, triangles))
+    here = Surface(wrap, triangles).facing(surface.vertices, surface.normals)
+    found = {}
+    for limb in (each for each in LIMBS if each in digits.tips):
+        own, native = guide.along[limb], digits.along[limb]
+        on = _most(native[:, surface.triangles[there.faces]], there.shares)
+        by = _most(own[:, triangles[here.faces]], here.shares)
+        for digit in range(len(own)):
+            found[_digit_name(limb, digit)] = Share(
+                wrap=_mean(on[own[digit] > _OUTER] == digit),
+                native=_mean(by[native[digit] > _OUTER] == digit),
+            )
+    return found
+
+
+def _most(along: np.ndarray, shares: np.ndarray) -> np.ndarray:
+    """Digit (m,) on which points lie that have `shares` (m, 3) of corners with (5, m, 3); 5 where on none."""
+    value = np.einsum("dmk,mk->dm", along, shares)
+    return np.where(value.max(0) > 0, value.argmax(0), len(along))
+
+
+def faults(
+    covered: Mapping[str, Share],
+    matched: Mapping[str, Share],
+    extremities: Mapping[str, int | None],
+    *,
+    told: Collection[str] = (),
+) -> tuple[str, ...]:
+    """What makes a wrap unfit for use, one sentence each.
+
+    Hands without fingers, mittens and fists, are none; their fingers cannot be asked to cover anything.
+
+    Args:
+        covered: of :func:`coverage`.
+        matched: of :func:`matches`.
+        extremities: limb -> how many stand out of the native skin.
+        told: limbs whose fingers a user told by landmarks.
+    """
+    found = [
+        f"{limb}: {count} fingers stand out of the mesh, not 5, so that none can be told from another"
+        for limb, count in extremities.items()
+        if limb.endswith("Hand") and limb not in told and (count or 0) > _MITTEN and count != 5
+    ]
+    found += [
+        f"{name}: {1 - share.wrap:.0%} lies beside its own, of which {1 - share.native:.0%} is without it"
+        for name, share in matched.items()
+        if share.least < MATCHED
+    ]
+    bare = {_digit_name(limb, i) for limb in LIMBS for i in range(5) if (extremities[limb] or 0) <= _MITTEN}
+    found += [
+        f"{name}: {1 - share.wrap:.0%} is off the mesh, {1 - share.native:.0%} of the mesh there is bare"
+        for name, share in covered.items()
+        if share.least < COVERED and name not in bare
+    ]
+    return tuple(found)
+
+
+def without_digits(extremities: Mapping[str, int | None]) -> list[str]:
+    """What is said of hands and feet whose fingers or toes do not stand apart."""
+    return [
+        f"{limb}: no separate {'fingers' if limb.endswith('Hand') else 'toes'}, {count or 'no'} stand out"
+        for limb, count in extremities.items()
+        if count != 5 and (limb.endswith("Foot") or (count or 0) <= _MITTEN)
+    ]

@@ -1,0 +1,99 @@
+"""Fingers and toes are told apart on any tessellation, and a wrap that mixes them up is found out."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import trimesh
+
+from soma_core.registration.coverage import COVERED, MATCHED, Share, coverage, faults, matches, without_digits
+from soma_core.registration.digits import LIMBS, digit_guide
+from soma_core.registration.surface import Surface
+from soma_core.rig import load_canonical
+
+TIP_M = 0.012  # a tip is the vertex furthest from the wrist, on a coarse mesh another one
+AWAY_M = 0.03  # what a rough fit may be off at wrists and insteps
+
+
+@pytest.fixture(scope="module")
+def guide():
+    return digit_guide()
+
+
+@pytest.fixture(scope="module")
+def halved(guide) -> tuple[Surface, np.ndarray]:
+    """The bind shape in another tessellation: centres of faces joined, with noise; and its canonical twin."""
+    mesh = guide.mesh
+    skin = mesh.triangles[~np.isin(mesh.triangles, mesh.face_interior).any(1)].astype(np.int64)
+    used, place = np.unique(skin, return_inverse=True)
+    vertices, triangles = trimesh.remesh.subdivide(mesh.vertices[used], place.reshape(-1, 3))
+    noise = np.random.default_rng(0).normal(scale=3e-4, size=vertices.shape)
+    return Surface(vertices + noise, triangles), mesh.vertices
+
+
+def test_each_limb_has_five_in_their_order(guide, halved) -> None:
+    surface, body = halved
+    found = guide.find(surface, body + np.array([0, AWAY_M, 0]))
+    assert found.counts == dict.fromkeys(LIMBS, 5)
+    for limb in LIMBS:
+        gap = np.linalg.norm(surface.vertices[found.tips[limb]][:, None] - body[guide.tips[limb]], axis=2)
+        assert (gap.argmin(1) == np.arange(5)).all()
+        assert np.diag(gap).max() < TIP_M
+
+
+def test_both_hands_are_mirror_images(guide) -> None:
+    mirror = guide.mesh.mirror
+    for kind in ("Hand", "Foot"):
+        left, right = (guide.along[f"{side}{kind}"] for side in ("Left", "Right"))
+        assert np.abs(left[:, mirror] - right).max() < 0.05  # shares; triangles split quads differently
+
+
+def test_a_landmark_decides(guide, halved) -> None:
+    surface, body = halved
+    index, ring = guide.tips["LeftHand"][[1, 3]]
+    found = guide.find(surface, body, marks=(np.array([index]), body[[ring]]))
+    gap = np.linalg.norm(surface.vertices[found.tips["LeftHand"][1]] - body[ring])
+    assert gap < TIP_M
+
+
+def test_fingers_that_are_none_are_said(guide, halved) -> None:
+    _, body = halved
+    stump = body.copy()
+    for along in guide.along["LeftHand"]:
+        stump[along > 0] = body[(along > 0) & (along < 0.2)].mean(0)
+    found = guide.find(Surface(stump, guide.mesh.triangles.astype(np.int64)), body)
+    assert "LeftHand" not in found.tips
+    assert "RightHand" in found.tips
+    assert any(text.startswith("LeftHand: no separate fingers") for text in without_digits({"LeftHand": 1}))
+
+
+def test_a_finger_on_its_neighbour_is_found_out(guide, halved) -> None:
+    surface, body = halved
+    right = guide.find(surface, body)
+    shares = matches(body, surface, right, guide)
+    assert len(shares) == 20
+    assert min(share.least for share in shares.values()) > MATCHED
+    ring, pinky = guide.along["LeftHand"][3] > 0, guide.along["LeftHand"][4] > 0
+    shifted = body.copy()
+    offset = body[pinky].mean(0) - body[ring].mean(0)
+    shifted[ring] += offset
+    mesh, rig = load_canonical("mid")
+    shares = matches(shifted, surface, guide.find(surface, shifted), guide)
+    assert shares["LeftRing"].least < 0.5 * MATCHED
+    assert shares["RightRing"].least > MATCHED
+    covered = coverage(shifted, surface, mesh, rig, np.isin(np.arange(len(body)), mesh.face_interior))
+    assert covered["LeftRing"].least < COVERED
+    assert covered["RightRing"].least > COVERED
+    said = faults(covered, shares, dict.fromkeys(LIMBS, 5))
+    assert any(text.startswith("LeftRing: ") for text in said)
+    assert not any("Right" in text for text in said)
+
+
+@pytest.mark.parametrize(
+    ("count", "told", "refused"), [(4, (), True), (4, ("LeftHand",), False), (2, (), False)]
+)
+def test_fingers_that_cannot_be_told_apart_are_refused_by_name(count, told, refused) -> None:
+    counts = dict.fromkeys(LIMBS, 5) | {"LeftHand": count}
+    said = faults({"head": Share(wrap=1.0, native=1.0)}, {}, counts, told=told)
+    text = f"LeftHand: {count} fingers stand out of the mesh, not 5, so that none can be told from another"
+    assert said == ((text,) if refused else ())
