@@ -42,9 +42,9 @@ class View:
     """Where the camera looks: a point, the direction towards it, the height seen [m], what is up."""
 
     focus: np.ndarray
-    towards: tuple[float, float, float]
+    towards: tuple[float, float, float] | np.ndarray
     height: float
-    up: tuple[float, float, float] = (0.0, 1.0, 0.0)
+    up: tuple[float, float, float] | np.ndarray = (0.0, 1.0, 0.0)
 
 
 def draw_wrap(path: Path, found: Registration, quality: Quality, mesh: CanonicalMesh) -> None:
@@ -168,7 +168,7 @@ class _Scene:
             )
             out, across = tip - wrist, index - pinky
             back = np.cross(middle - wrist, across) * (-1 if side == "Left" else 1)
-            height = 1.7 * np.linalg.norm(middle - wrist) + 1.2 * np.linalg.norm(tip - middle)
+            height = float(1.7 * np.linalg.norm(middle - wrist) + 1.2 * np.linalg.norm(tip - middle))
             for name, towards in (("back", back), ("palm", -back)):
                 view = View(focus=(wrist + tip) / 2, towards=towards, height=height, up=-out)
                 cells.append((f"{side.lower()} hand, {name}", shot(shown, view)))
