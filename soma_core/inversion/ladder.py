@@ -25,6 +25,9 @@ __all__ = ["Ladder"]
 
 _STARTS = ("procrustes", "transfer")
 
+_ON_THE_WAY = 1e-3
+"""Tolerance of steps on moments where the whole model is fitted after them [m]: offsets move more than that."""
+
 
 class Ladder(torch.nn.Module):
     """Runs the stages in order, each from the result of the one before.
@@ -117,7 +120,7 @@ class Ladder(torch.nn.Module):
             problem.rest,
             pose or self._procrustes(problem, None, model),
             iterations=self.options.iterations,
-            tolerance=self.options.tolerance,
+            tolerance=self.options.tolerance if self.plain else max(self.options.tolerance, _ON_THE_WAY),
             terms=problem.terms,
         )
 

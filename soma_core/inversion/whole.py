@@ -17,7 +17,7 @@ from soma_core.inversion.targets import LadderOptions, Targets
 
 __all__ = ["WholeFit", "is_worse", "lopsided", "of_another_rig", "right_vertices"]
 
-_ROUNDS, _STEPS = 2, 5
+_ROUNDS, _STEPS = 2, 3
 """How often offsets and limbs' twists are looked at before the descent, and steps on moments after each."""
 
 _KEPT = 8e-3
