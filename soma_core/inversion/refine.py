@@ -16,6 +16,7 @@ from torch import Tensor
 
 from soma_core.inversion.priors import JointTerms, TwistDoubt
 from soma_core.inversion.problem import Pose, Problem, View
+from soma_core.inversion.gauss_newton import LONGEST_STEP
 from soma_core.inversion.protocol import ForwardModel
 
 __all__ = ["Refinement", "clumping"]
@@ -31,6 +32,9 @@ bad one, largest."""
 _EARLY, _EVERY = (0, 1, 3, 5), (5, 3)
 """Steps at which the matrix is made anew: the first ones, and those that leave the second of these numbers
 when divided by the first. In between, the memory makes up for what changes."""
+
+_AT_ONCE = 8
+"""Steps that a kernel takes before those that still move are brought together."""
 
 _CROWDED = 0.75
 """Share of frames that still move from which those that rest are carried along."""
@@ -128,6 +132,9 @@ class Refinement:
                 is below this [m],
             share: or below this share of the error that is left.
         """
+        found = self._in_lanes(start, iterations, tolerance, share)
+        if found is not None:
+            return found
         solver, here, pose, out = self.model.solver, self, start, start
         view = self._first_view(start)
         rows = torch.arange(len(self.mass), device=self.mass.device)
@@ -176,6 +183,50 @@ class Refinement:
             if len(refused) and not _renewed(count + 1):
                 solve = here._again(solve, refused, pose, view, damping)
         return out.put(rows, pose)
+
+    def _in_lanes(self, start: Pose, iterations: int, tolerance: float, share: float) -> Pose | None:
+        """The same by a kernel that takes groups of frames through many steps; None where there is none.
+
+        Those that still move are brought together from time to time, and begin anew where they are.
+        """
+        model, dtype = self.model, self.mass.dtype
+        descend = getattr(model, "descend", None)
+        if descend is None:
+            return None
+        structure = model.structure
+        unit = 1 / (float((structure.influence_weight**2).sum()) * _PIECE * len(structure.fitted))
+        damping, weight = torch.full_like(self.mass, _START_DAMPING), None
+        clip = None if self.bound is None or self.typical is None else (self.bound, self.typical)
+        pose = out = replace(start, last_change=torch.full_like(self.mass, torch.inf))
+        problem, rows = self.problem, torch.arange(len(self.mass))
+        while True:
+            steps = min(iterations, _AT_ONCE)
+            iterations -= steps
+            from soma_core.kernels.descent_wp import DescentRule
+
+            rule = DescentRule(
+                iterations=steps, renewed=_EARLY, tolerance=tolerance, share=share, unit=unit,
+                least=torch.finfo(dtype).tiny, noise=_NOISE[dtype], floor=_FLOOR[dtype] ** 2, lower=_LOWER,
+                raised=_RAISE, least_raised=_LEAST_RAISED, most=_MOST_DAMPING, longest=LONGEST_STEP,
+            )  # fmt: skip
+            found = descend(
+                problem, pose, rule, doubt=problem.doubt, clip=clip, damping=damping, weight=weight
+            )
+            if found is None:
+                return None
+            pose = Pose(
+                relative=found.relative, translation=found.hips, last_change=found.change,
+                accepted=pose.accepted + found.accepted.to(pose.accepted),
+            )  # fmt: skip
+            out = out.put(rows, pose)
+            still = torch.nonzero(found.change > 0).flatten()
+            if not iterations or not len(still):
+                return out
+            if len(still) < len(rows):
+                still = problem.several(still)
+                rows, problem, pose = rows[still], problem.part(still), pose.part(still)
+                clip = None if clip is None else (clip[0][still], clip[1][still])
+            damping, weight = found.damping[still], found.weight[still]
 
     def part(self, rows: Tensor) -> Refinement:
         """The same of some frames, where their doubt of twists is settled."""

@@ -31,6 +31,7 @@ from soma_core.rig.skeleton import Rig
 from soma_core.skeleton.identity import Identity
 
 if TYPE_CHECKING:
+    from soma_core.kernels.descent_wp import Descended, DescentRule
     from soma_core.kernels.pose_solver_wp import Factor, PoseSolver
 
 __all__ = ["Kind", "SkinModel"]
@@ -291,6 +292,26 @@ class SkinModel(torch.nn.Module):
             return damped_inverse(matrix, damping)
         steps, factor = self._steps, self._factor(problem, pose, view.activity, damping, mass)
         return lambda slope: steps.solve(factor, slope)
+
+    def descend(
+        self, problem: Problem, pose: Pose, rule: DescentRule, *, doubt: TwistDoubt | None,
+        clip: tuple[Tensor, Tensor] | None, damping: Tensor, weight: Tensor | None,
+    ) -> Descended | None:  # fmt: skip
+        """Poses after a whole descent by kernels; None where they do not know it: on a GPU, and with terms."""
+        if self._steps is None or pose.relative.is_cuda or problem.terms is not None:
+            return None
+        from soma_core.kernels.descent_wp import descend
+
+        known = None
+        if doubt is not None:
+            known = self.solver.columns(doubt.variable), doubt.axis.contiguous(), doubt.square
+        frames = len(pose.translation)
+        return descend(
+            self._steps, self._constants(problem.rest), self.residual.tables, rule, known,
+            problem.identity.rest, problem.weights, pose.relative, pose.translation, damping,
+            problem.weights.sum(1).expand(frames), self.scale(problem).expand(frames), problem.vertices,
+            problem.origin, clip, weight,
+        )  # fmt: skip
 
     def angle_variance(self, problem: Problem, pose: Pose) -> Tensor:
         """Mean square angle (F, n) [rad^2] of each variable's own turn under vertex noise of variance 1 m^2.

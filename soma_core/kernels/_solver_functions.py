@@ -5,6 +5,7 @@ from types import SimpleNamespace
 
 import warp as wp
 
+from soma_core.kernels import _descent_text as descent
 from soma_core.kernels import _matrix_text as matrix
 from soma_core.kernels import _solver_text as text
 from soma_core.kernels import _variance_text as variance
@@ -21,6 +22,7 @@ _BARE = {
     "assemble": matrix.ASSEMBLE, "twists": matrix.TWISTS, "modes": matrix.MODES, "factor": matrix.FACTOR,
     "forces": text.FORCES, "solve": text.SOLVE, "selected": variance.SELECTED, "keep": view.KEEP,
     "transform": view.TRANSFORM, "activate": view.ACTIVATE, "pull": view.PULL, "turn": view.TURN,
+    "begun": descent.BEGUN, "taken": descent.TAKEN,
 }  # fmt: skip
 """Bodies that take nothing but the lists and the memory."""
 
@@ -62,12 +64,47 @@ def solver_functions(scalar: str, lanes: int, *, shared: bool) -> SimpleNamespac
         count: int,
     ): ...  # fmt: skip
 
+    def given(plan: _ids, numbers: real, k: real, s: real, f: real, turned: real, source: real): ...
+
+    def brought(
+        plan: _ids, numbers: real, k: real, s: real, f: real, forced: real, back: real, tile: real, at: int
+    ): ...  # fmt: skip
+
+    def weighed(
+        plan: _ids, numbers: real, k: real, s: real, f: real, base: real, squares: real, count: int,
+        first: int, unit: number, least: number,
+    ): ...  # fmt: skip
+
+    def combined(plan: _ids, numbers: real, k: real, s: real, f: real, clipped: int): ...
+
+    def doubted(
+        plan: _ids, numbers: real, k: real, s: real, f: real, columns: _ids, squares: real, count: int
+    ): ...  # fmt: skip
+
+    def drawn(plan: _ids, numbers: real, k: real, s: real, f: real, count: int): ...
+
+    def mixed(plan: _ids, numbers: real, k: real, s: real, f: real, count: int, longest: number): ...
+
+    def judged(
+        plan: _ids, numbers: real, k: real, s: real, f: real, tolerance: number, share: number
+    ) -> int:  # fmt: skip
+        return 0
+
+    def accepted(
+        plan: _ids, numbers: real, k: real, s: real, f: real, count: int, noise: number, floor_: number,
+        lower: number, raise_: number, least: number, most: number, shorten: number,
+    ): ...  # fmt: skip
+
     def root_turn(plan: _ids, numbers: real, k: real, s: real, f: real, damping_start: number): ...
 
     bodies = {
         "walk": (text.WALK, walk), "change": (text.CHANGE, change), "copy": (text.BEGIN, copy),
         "terms": (text.TERMS, terms), "move": (text.MOVE, move), "accept": (text.ACCEPT, accept),
-        "still": (text.STILL, root_turn), "doubt": (view.DOUBT, doubt),
+        "still": (text.STILL, root_turn), "doubt": (view.DOUBT, doubt), "given": (descent.GIVEN, given),
+        "brought": (descent.BROUGHT, brought), "weighed": (descent.WEIGHED, weighed),
+        "combined": (descent.COMBINED, combined), "doubted": (descent.DOUBTED, doubted),
+        "drawn": (descent.DRAWN, drawn), "mixed": (descent.MIXED, mixed), "judged": (descent.JUDGED, judged),
+        "accepted": (descent.ACCEPTED, accepted),
     }  # fmt: skip
     for name, body in _BARE.items():
 

@@ -153,8 +153,12 @@ class ModelResidual(torch.nn.Module):
                 return residual_by_patches(self._patches, *given, gradient=gradient, distances=distances)
         from soma_core.kernels.model_residual_wp import residual_sums
 
-        tables = {name: self.get_buffer(name) for name in self._names}
-        return residual_sums(tables, *given, gradient=gradient, distances=distances)
+        return residual_sums(self.tables, *given, gradient=gradient, distances=distances)
+
+    @property
+    def tables(self) -> dict[str, Tensor]:
+        """Constants of the Warp twin on a CPU."""
+        return {name: self.get_buffer(name) for name in self._names}
 
     def _by_torch(self, rest, weights, transforms, activations, scale, targets, origin, bound):
         """Energy, forces, pull and distances of all frames."""

@@ -26,7 +26,7 @@ from soma_core.kernels._native import transposing
 from soma_core.kernels._residual_phases import TILE, phases, tile_slots
 from soma_core.kernels._runtime import as_warp, scalar_name
 
-__all__ = ["residual_sums", "residual_tables"]
+__all__ = ["Compared", "gathering", "residual_sums", "residual_tables", "skinning"]
 
 _ids, _short = wp.array(dtype=wp.int32), wp.array(dtype=wp.int16)
 
@@ -36,7 +36,7 @@ _TOGETHER = 4
 
 
 @wp.struct
-class _Task:
+class Compared:
     """Counts and switches of one launch; groups begin .. end of frames."""
 
     begin: int
@@ -59,14 +59,14 @@ def _kernel(scalar: str, lanes: int):
     real, rows = wp.array(dtype=getattr(wp, scalar)), wp.array3d(dtype=getattr(wp, scalar))
     (load, store), row = transposing(scalar, lanes), row_of(scalar)
     step = phases(scalar, lanes)
-    enter, gather, leave = _enter(real, load, step), _gather(real, load, step), _leave(real, store)
+    enter, gather, leave = _enter(real, load, step), gathering(real, load, step), _leave(real, store)
     clear, moved, draw, push = step.clear, step.moved, step.pulled, step.forces
-    skinned = _skinned(real, step)
+    skinned = skinning(real, step)
     module = wp.get_module(f"soma_model_residual_{scalar}_{lanes}")
 
     @wp.kernel(module=module, enable_backward=False)
     def run(
-        task: _Task,
+        task: Compared,
         skin_start: _ids, skin_joint: _short, skin_value: real,
         joint_run: _ids, joint_id: _short, joint_start: _ids, joint_row: _short, joint_value: real,
         move_start: _ids, move_id: _short, move_value: real,
@@ -112,7 +112,7 @@ def _enter(real, load, step):
 
     @wp.func
     def enter(
-        task: _Task, f: int, transforms: real, active: real, scale: real, origin: real, bound: real,
+        task: Compared, f: int, transforms: real, active: real, scale: real, origin: real, bound: real,
         turn: real, source: real, tile: real,
     ):  # fmt: skip
         """Bring what each frame has one of into lanes."""
@@ -131,12 +131,12 @@ def _enter(real, load, step):
     return enter
 
 
-def _gather(real, load, step):
+def gathering(real, load, step):
     slots, points = tile_slots(), step.points
     at_point, at_target, at_weight = slots.point, slots.target, slots.weight
 
     @wp.func
-    def gather(task: _Task, f: int, a: int, b: int, rest: real, weights: real, targets: real, tile: real):
+    def gather(task: Compared, f: int, a: int, b: int, rest: real, weights: real, targets: real, tile: real):
         """Bring rest points, weights and targets of vertices a .. b into lanes."""
         last = task.frames - 1
         stride = wp.int64(3 * task.vertices)
@@ -151,12 +151,12 @@ def _gather(real, load, step):
     return gather
 
 
-def _skinned(real, step):
+def skinning(real, step):
     residual = step.residual
 
     @wp.func
     def skinned(
-        task: _Task, start: _ids, joint: _short, value: real, turn: real, weights: real, a: int, b: int,
+        task: Compared, start: _ids, joint: _short, value: real, turn: real, weights: real, a: int, b: int,
         tile: real,
     ):  # fmt: skip
         """Skin vertices a .. b and weigh what they miss."""
@@ -173,7 +173,7 @@ def _leave(real, store):
 
     @wp.func
     def leave(
-        task: _Task, f: int, tile: real, force: real, back: real, energy: real, forces: real, pull: real
+        task: Compared, f: int, tile: real, force: real, back: real, energy: real, forces: real, pull: real
     ):
         """Write the sums of a group of frames."""
         last = task.frames - 1
@@ -214,7 +214,7 @@ def residual_sums(
         workers = worker_count(part.stop - part.start, lanes)
         together = 1 if lanes == 1 else min(_TOGETHER, part.stop - part.start)
         work = [working_rows(targets, workers * together, size, lanes) for size in sizes]
-        task = _Task()
+        task = Compared()
         task.begin, task.end, task.together = part.start, part.stop, together
         task.frames, task.vertices = count, vertices
         task.joints, task.activations = joints, activations

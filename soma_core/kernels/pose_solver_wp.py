@@ -148,6 +148,7 @@ class PoseSolver:
             place["damping"],
             place["activity"], counts["activation_count"], place["scale"], place["transform"],
             place["active"], place["before"], place["push"], place["pull"], place["gained"],
+            place["typical"], place["doubt_weight"],
         )  # fmt: skip
         self.at = torch.tensor(at, dtype=torch.int32, device=device)
         self.memory, self.kept = sum(slots.values()), sum(kept.values())
