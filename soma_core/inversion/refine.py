@@ -33,8 +33,8 @@ _EARLY, _EVERY = (0, 1, 3, 5), (5, 3)
 """Steps at which the matrix is made anew: the first ones, and those that leave the second of these numbers
 when divided by the first. In between, the memory makes up for what changes."""
 
-_AT_ONCE = 8
-"""Steps that a kernel takes before those that still move are brought together."""
+_AT_ONCE = 2
+"""Steps that a kernel takes, after its first ones, before those frames that still move are brought together."""
 
 _CROWDED = 0.75
 """Share of frames that still move from which those that rest are carried along."""
@@ -122,7 +122,9 @@ class Refinement:
         self.weight: Tensor | None = None
         self.mass = problem.weights.sum(1).expand(len(problem.vertices))
 
-    def __call__(self, start: Pose, *, iterations: int, tolerance: float, share: float = 0.0) -> Pose:
+    def __call__(
+        self, start: Pose, *, iterations: int, tolerance: float, share: float = 0.0, at_once: int = 5
+    ) -> Pose:
         """Refine poses; `last_change` becomes zero where a frame rests, else what its Newton step would do.
 
         Args:
@@ -131,8 +133,9 @@ class Refinement:
             tolerance: a frame rests once its Newton decrement, as a root mean square change of the vertices,
                 is below this [m],
             share: or below this share of the error that is left.
+            at_once: steps that all frames take together, as most of them need.
         """
-        found = self._in_lanes(start, iterations, tolerance, share)
+        found = self._in_lanes(start, iterations, tolerance, share, at_once)
         if found is not None:
             return found
         solver, here, pose, out = self.model.solver, self, start, start
@@ -184,7 +187,9 @@ class Refinement:
                 solve = here._again(solve, refused, pose, view, damping)
         return out.put(rows, pose)
 
-    def _in_lanes(self, start: Pose, iterations: int, tolerance: float, share: float) -> Pose | None:
+    def _in_lanes(
+        self, start: Pose, iterations: int, tolerance: float, share: float, at_once: int
+    ) -> Pose | None:
         """The same by a kernel that takes groups of frames through many steps; None where there is none.
 
         Those that still move are brought together from time to time, and begin anew where they are.
@@ -193,25 +198,22 @@ class Refinement:
         descend = getattr(model, "descend", None)
         if descend is None:
             return None
+        from soma_core.kernels.descent_wp import DescentRule
+
         structure = model.structure
         unit = 1 / (float((structure.influence_weight**2).sum()) * _PIECE * len(structure.fitted))
-        damping, weight = torch.full_like(self.mass, _START_DAMPING), None
+        damping, state = torch.full_like(self.mass, _START_DAMPING), None
         clip = None if self.bound is None or self.typical is None else (self.bound, self.typical)
         pose = out = replace(start, last_change=torch.full_like(self.mass, torch.inf))
-        problem, rows = self.problem, torch.arange(len(self.mass))
+        problem, rows, begin, end = self.problem, torch.arange(len(self.mass)), 0, min(at_once, iterations)
         while True:
-            steps = min(iterations, _AT_ONCE)
-            iterations -= steps
-            from soma_core.kernels.descent_wp import DescentRule
-
             rule = DescentRule(
-                iterations=steps, renewed=_EARLY, tolerance=tolerance, share=share, unit=unit,
-                least=torch.finfo(dtype).tiny, noise=_NOISE[dtype], floor=_FLOOR[dtype] ** 2, lower=_LOWER,
-                raised=_RAISE, least_raised=_LEAST_RAISED, most=_MOST_DAMPING, longest=LONGEST_STEP,
+                begin=begin, end=end, renewed=tuple(filter(_renewed, range(begin, end + 1))), unit=unit,
+                tolerance=tolerance, share=share, least=torch.finfo(dtype).tiny, noise=_NOISE[dtype],
+                floor=_FLOOR[dtype] ** 2, lower=_LOWER, raised=_RAISE, least_raised=_LEAST_RAISED,
+                most=_MOST_DAMPING, longest=LONGEST_STEP,
             )  # fmt: skip
-            found = descend(
-                problem, pose, rule, doubt=problem.doubt, clip=clip, damping=damping, weight=weight
-            )
+            found = descend(problem, pose, rule, doubt=problem.doubt, clip=clip, damping=damping, state=state)
             if found is None:
                 return None
             pose = Pose(
@@ -220,13 +222,14 @@ class Refinement:
             )  # fmt: skip
             out = out.put(rows, pose)
             still = torch.nonzero(found.change > 0).flatten()
-            if not iterations or not len(still):
+            if end == iterations or not len(still):
                 return out
             if len(still) < len(rows):
                 still = problem.several(still)
                 rows, problem, pose = rows[still], problem.part(still), pose.part(still)
                 clip = None if clip is None else (clip[0][still], clip[1][still])
-            damping, weight = found.damping[still], found.weight[still]
+            damping, state = found.damping[still], found.state[still]
+            begin, end = end, min(end + _AT_ONCE, iterations)
 
     def part(self, rows: Tensor) -> Refinement:
         """The same of some frames, where their doubt of twists is settled."""

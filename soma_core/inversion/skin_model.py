@@ -295,7 +295,7 @@ class SkinModel(torch.nn.Module):
 
     def descend(
         self, problem: Problem, pose: Pose, rule: DescentRule, *, doubt: TwistDoubt | None,
-        clip: tuple[Tensor, Tensor] | None, damping: Tensor, weight: Tensor | None,
+        clip: tuple[Tensor, Tensor] | None, damping: Tensor, state: Tensor | None,
     ) -> Descended | None:  # fmt: skip
         """Poses after a whole descent by kernels; None where they do not know it: on a GPU, and with terms."""
         if self._steps is None or pose.relative.is_cuda or problem.terms is not None:
@@ -310,7 +310,7 @@ class SkinModel(torch.nn.Module):
             self._steps, self._constants(problem.rest), self.residual.tables, rule, known,
             problem.identity.rest, problem.weights, pose.relative, pose.translation, damping,
             problem.weights.sum(1).expand(frames), self.scale(problem).expand(frames), problem.vertices,
-            problem.origin, clip, weight,
+            problem.origin, clip, state,
         )  # fmt: skip
 
     def angle_variance(self, problem: Problem, pose: Pose) -> Tensor:

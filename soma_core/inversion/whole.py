@@ -28,6 +28,9 @@ _RESTING, _RESTING_SHARE, _COARSE_SHARE = 1.5e-7, 1e-2, 2e-2
 """A frame rests where a Newton step would change it by less, as a root mean square of its vertices [m], or
 relative to the error that is left; the last on the way, on few vertices, whose minimum is another."""
 
+_AT_ONCE = (5, 1)
+"""Steps that all frames take together: on the way, and at the end, where many rest at once."""
+
 _SAMPLED = 8
 """Every so many vertices have a say in a frame's median residual."""
 
@@ -254,7 +257,10 @@ class WholeFit:
         clips = () if clip is None else clip
         share = _RESTING_SHARE if model is self.model else _COARSE_SHARE
         refinement = Refinement(model, problem, *clips)
-        return refinement(pose, iterations=self.options.refreshes, tolerance=_RESTING, share=share)
+        return refinement(
+            pose, iterations=self.options.refreshes, tolerance=_RESTING, share=share,
+            at_once=_AT_ONCE[model is not self.coarse],
+        )  # fmt: skip
 
     def _searched(self, problem: Problem, pose: Pose) -> Pose:
         """Frames that may rest beside their minimum are tried from other limb twists."""

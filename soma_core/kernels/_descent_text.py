@@ -16,11 +16,12 @@ BEGUN = (
     _RANGE
     + """
     for (int i = 0; i < 9 * joint_count; i++) trial_relative[i] = relative[i];
+    moving[0] = one; accepted[0] = zero;
+    if (again) return;
     for (int i = 0; i < memory_; i++) past_inverse[i] = zero;
     for (int i = 0; i < 2 * memory_ * size_; i++) past[i] = zero;
     for (int i = from_; i < size_; i++) gradient[i] = fresh[i];
-    energy[0] = reached[0]; pressing[0] = pressing_next[0];
-    moving[0] = shrink[0] = one; accepted[0] = zero;
+    energy[0] = reached[0]; pressing[0] = pressing_next[0]; shrink[0] = one;
 """
 )
 

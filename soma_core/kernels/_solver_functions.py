@@ -22,7 +22,7 @@ _BARE = {
     "assemble": matrix.ASSEMBLE, "twists": matrix.TWISTS, "modes": matrix.MODES, "factor": matrix.FACTOR,
     "forces": text.FORCES, "solve": text.SOLVE, "selected": variance.SELECTED, "keep": view.KEEP,
     "transform": view.TRANSFORM, "activate": view.ACTIVATE, "pull": view.PULL, "turn": view.TURN,
-    "begun": descent.BEGUN, "taken": descent.TAKEN,
+    "taken": descent.TAKEN,
 }  # fmt: skip
 """Bodies that take nothing but the lists and the memory."""
 
@@ -81,6 +81,8 @@ def solver_functions(scalar: str, lanes: int, *, shared: bool) -> SimpleNamespac
         plan: _ids, numbers: real, k: real, s: real, f: real, columns: _ids, squares: real, count: int
     ): ...  # fmt: skip
 
+    def begun(plan: _ids, numbers: real, k: real, s: real, f: real, again: int): ...
+
     def drawn(plan: _ids, numbers: real, k: real, s: real, f: real, count: int): ...
 
     def mixed(plan: _ids, numbers: real, k: real, s: real, f: real, count: int, longest: number): ...
@@ -103,7 +105,7 @@ def solver_functions(scalar: str, lanes: int, *, shared: bool) -> SimpleNamespac
         "still": (text.STILL, root_turn), "doubt": (view.DOUBT, doubt), "given": (descent.GIVEN, given),
         "brought": (descent.BROUGHT, brought), "weighed": (descent.WEIGHED, weighed),
         "combined": (descent.COMBINED, combined), "doubted": (descent.DOUBTED, doubted),
-        "drawn": (descent.DRAWN, drawn), "mixed": (descent.MIXED, mixed), "judged": (descent.JUDGED, judged),
+        "begun": (descent.BEGUN, begun), "drawn": (descent.DRAWN, drawn), "mixed": (descent.MIXED, mixed), "judged": (descent.JUDGED, judged),
         "accepted": (descent.ACCEPTED, accepted),
     }  # fmt: skip
     for name, body in _BARE.items():

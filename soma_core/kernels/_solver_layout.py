@@ -51,9 +51,10 @@ def slot_sizes(n: Mapping[str, int]) -> dict[str, int]:
         "features": 9 * n["feature_columns"] * n["used_count"], "response": n["response_size"],
         "mode_rows": n["mode_rows"], "mode_tree": n["mode_tree"], "opened": n["opened"],
         "mode_force": 9 * c if n["block_count"] else 0,
-        "gradient": 3 * c + 3, "fresh": 3 * c + 3, "step": 3 * c + 3, "past": 2 * MEMORY * (3 * c + 3),
-        "past_inverse": MEMORY, "past_share": MEMORY, "reached": 1, "energy": 1, "shrink": 1, "pressing": 1,
-        "pressing_next": 1, "typical": 1, "doubt_weight": 1,
+        "gradient": 3 * c + 3, "past": 2 * MEMORY * (3 * c + 3), "past_inverse": MEMORY, "energy": 1,
+        "shrink": 1, "pressing": 1, "doubt_weight": 1,
+        "fresh": 3 * c + 3, "step": 3 * c + 3, "past_share": MEMORY, "reached": 1, "pressing_next": 1,
+        "typical": 1,
         "selected": 9 * (n["slot_count"] + c + 1),
     }  # fmt: skip
 

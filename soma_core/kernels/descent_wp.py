@@ -50,15 +50,15 @@ def _kernel(scalar: str, width: int, *, shared: bool):
     @wp.kernel(module=module, enable_backward=False)
     def descent(
         task: Task, seen: Compared, plan: _ids, numbers: real, constants: rows, memory: rows, kept: rows,
-        at: _ids, rules: real, renewed: int, columns: _ids, spins: real, base: real,
+        at: _ids, rules: real, renewed: int, done: int, columns: _ids, spins: real, base: real,
         skin_start: _ids, skin_joint: _short, skin_value: real,
         joint_run: _ids, joint_id: _short, joint_start: _ids, joint_row: _short, joint_value: real,
         move_start: _ids, move_id: _short, move_value: real,
         rest: real, weights: real, relative: real, hips: real, damping: real, mass: real, scale: real,
-        targets: real, origin: real, bound: real, typical: real, weight: real,
+        targets: real, origin: real, bound: real, typical: real, state: real,
         turns: rows, sources: rows, pushes: rows, pulls: rows, tiles: rows, squares: rows,
         relative_out: real, hips_out: real, damping_out: real, accepted_out: real, change_out: real,
-        weight_out: real,
+        state_out: real,
     ):  # fmt: skip
         w, last, count = wp.tid(), task.frames - 1, task.soft_count
         turned, source, force, back = row(turns, w), row(sources, w), row(pushes, w), row(pulls, w)
@@ -72,7 +72,7 @@ def _kernel(scalar: str, width: int, *, shared: bool):
             load(mass, wp.int64(1), 0, 1, f, last, s, at[4])
             load(damping, wp.int64(1), 0, 1, f, last, s, at[18])
             load(scale, wp.int64(1), 0, 1, f, last, s, at[21])
-            load(weight, wp.int64(1), 0, 1, f, last, s, at[29])
+            load(state, wp.int64(at[30]), 0, at[30] * (1 - task.forced), f, last, s, at[29])
             load(origin, wp.int64(3), 0, 3, f, last, tile, at_origin)
             load(scale, wp.int64(1), 0, 1, f, last, tile, at_scale)
             if seen.clipped > 0:
@@ -80,34 +80,35 @@ def _kernel(scalar: str, width: int, *, shared: bool):
                 load(typical, wp.int64(1), 0, 1, f, last, s, at[28])
             for step in range(task.iterations + 1):
                 walk(plan, numbers, k, s, m, 0)
-                transform(plan, numbers, k, s, m)
-                activate(plan, numbers, k, s, m)
-                given(plan, numbers, k, s, m, turned, source)
-                clear(tile, at_energy, 1)
-                clear(force, 0, 12 * seen.joints)
-                clear(back, 0, seen.activations)
-                for t in range((seen.vertices + size - 1) // size):
-                    a = t * size
-                    b = wp.min(a + size, seen.vertices)
-                    gather(seen, f, a, b, rest, weights, targets, tile)
-                    moved(move_start, move_id, move_value, source, a, b, tile)
-                    skinned(seen, skin_start, skin_joint, skin_value, turned, weights, a, b, tile)
-                    draw(move_start, move_id, move_value, a, b, tile, back)
-                    push(joint_run, joint_id, joint_start, joint_row, joint_value, t, t + 1, tile, force)
-                brought(plan, numbers, k, s, m, force, back, tile, at_energy)
-                pull(plan, numbers, k, s, m)
-                forces(plan, numbers, k, s, m)
-                turn(plan, numbers, k, s, m)
+                if step + task.forced > 0:
+                    transform(plan, numbers, k, s, m)
+                    activate(plan, numbers, k, s, m)
+                    given(plan, numbers, k, s, m, turned, source)
+                    clear(tile, at_energy, 1)
+                    clear(force, 0, 12 * seen.joints)
+                    clear(back, 0, seen.activations)
+                    for t in range((seen.vertices + size - 1) // size):
+                        a = t * size
+                        b = wp.min(a + size, seen.vertices)
+                        gather(seen, f, a, b, rest, weights, targets, tile)
+                        moved(move_start, move_id, move_value, source, a, b, tile)
+                        skinned(seen, skin_start, skin_joint, skin_value, turned, weights, a, b, tile)
+                        draw(move_start, move_id, move_value, a, b, tile, back)
+                        push(joint_run, joint_id, joint_start, joint_row, joint_value, t, t + 1, tile, force)
+                    brought(plan, numbers, k, s, m, force, back, tile, at_energy)
+                    pull(plan, numbers, k, s, m)
+                    forces(plan, numbers, k, s, m)
+                    turn(plan, numbers, k, s, m)
                 first = wp.where(step == 0, task.forced, 0)
                 weighed(plan, numbers, k, s, m, base, square, count, first, rules[2], rules[3])
-                if count > 0:
+                if count * (step + task.forced) > 0:
                     doubt(plan, numbers, k, s, m, columns, spins, square, count)
                     combined(plan, numbers, k, s, m, seen.clipped)
                 if step == 0:
-                    begun(plan, numbers, k, s, m)
+                    begun(plan, numbers, k, s, m, 1 - task.forced)
                 else:
                     accepted(
-                        plan, numbers, k, s, m, step - 1, rules[4], rules[5], rules[6], rules[7], rules[8],
+                        plan, numbers, k, s, m, done + step - 1, rules[4], rules[5], rules[6], rules[7], rules[8],
                         rules[9], rules[10],
                     )  # fmt: skip
                 if (renewed >> step) & 1 > 0:
@@ -118,9 +119,9 @@ def _kernel(scalar: str, width: int, *, shared: bool):
                         modes(plan, numbers, k, s, m)
                     doubted(plan, numbers, k, s, m, columns, square, count)
                     factor(plan, numbers, k, s, m)
-                drawn(plan, numbers, k, s, m, step)
+                drawn(plan, numbers, k, s, m, done + step)
                 solve(plan, numbers, k, s, m)
-                mixed(plan, numbers, k, s, m, step, rules[11])
+                mixed(plan, numbers, k, s, m, done + step, rules[11])
                 if judged(plan, numbers, k, s, m, rules[0], rules[1]) == 0:
                     break
                 if step < task.iterations:
@@ -131,7 +132,7 @@ def _kernel(scalar: str, width: int, *, shared: bool):
             store(s, at[18], 1, damping_out, wp.int64(1), 0, f, last)
             store(s, at[9], 1, accepted_out, wp.int64(1), 0, f, last)
             store(s, at[10], 1, change_out, wp.int64(1), 0, f, last)
-            store(s, at[29], 1, weight_out, wp.int64(1), 0, f, last)
+            store(s, at[29], at[30], state_out, wp.int64(at[30]), 0, f, last)
 
     return descent
 
@@ -140,8 +141,8 @@ class DescentRule(NamedTuple):
     """How a descent goes on; names are those of ``inversion.refine``.
 
     Attributes:
-        iterations: largest number of steps.
-        renewed: steps, counted from 0, at which the matrix is made.
+        begin, end: steps that are taken, counted from the first look.
+        renewed: steps at which the matrix is made, beside the first.
         tolerance, share: where frames rest, [m] and relative.
         unit, least: factor of the clumps, and the least error they are measured by.
         noise, floor: relative and absolute rounding of an error, [m^2] for a mass of one.
@@ -149,7 +150,8 @@ class DescentRule(NamedTuple):
         longest: largest turn of a joint [rad].
     """
 
-    iterations: int
+    begin: int
+    end: int
     renewed: tuple[int, ...]
     tolerance: float
     share: float
@@ -172,7 +174,7 @@ class Descended(NamedTuple):
         damping: (F,) for a next one.
         accepted: (F,) steps taken.
         change: (F,) what a Newton step would still change [m], zero where a frame rests.
-        weight: (F,) of the doubt.
+        state: (F, k) for a next one.
     """
 
     relative: Tensor
@@ -180,14 +182,14 @@ class Descended(NamedTuple):
     damping: Tensor
     accepted: Tensor
     change: Tensor
-    weight: Tensor
+    state: Tensor
 
 
 def descend(
     solver: PoseSolver, constants: tuple[Tensor, bool], tables: Mapping[str, Tensor], rule: DescentRule,
     doubt: tuple[Tensor, Tensor, Tensor] | None, rest: Tensor, weights: Tensor, relative: Tensor,
     hips: Tensor, damping: Tensor, mass: Tensor, scale: Tensor, targets: Tensor, origin: Tensor,
-    clip: tuple[Tensor, Tensor] | None, weight: Tensor | None,
+    clip: tuple[Tensor, Tensor] | None, state: Tensor | None,
 ) -> Descended:  # fmt: skip
     """Lower the error of F frames.
 
@@ -201,7 +203,7 @@ def descend(
         damping, mass, scale: (F,).
         targets, origin: (F, v, 3) and (F, 3) [m].
         clip: lengths (F,) beyond which residuals count linearly, and typical ones; None for least squares.
-        weight: (F,) of the doubt; None where the first look tells it.
+        state: of an earlier descent of these frames, which this one goes on with; None begins anew.
     """
     count, vertices = targets.shape[:2]
     lanes, scalar = lane_count(targets), scalar_name(targets.dtype)
@@ -215,12 +217,13 @@ def descend(
     ])  # fmt: skip
     out = Descended(
         torch.empty_like(relative, memory_format=torch.contiguous_format), new(count, 3), new(count),
-        new(count), new(count), new(count),
+        new(count), new(count), new(count, solver.under_way),
     )  # fmt: skip
+    made = {0, *(step - rule.begin for step in rule.renewed if rule.begin <= step <= rule.end)}
     bound, typical = (none, none) if clip is None else clip
     given = [
         rest, weights, relative, hips, damping, mass, scale, targets, origin, bound, typical,
-        none.expand(count) if weight is None else weight,
+        none if state is None else state,
     ]  # fmt: skip
     given = [one.contiguous() for one in given]
     counts = solver.counts
@@ -232,7 +235,7 @@ def descend(
         work = [working_rows(targets, 1, size, lanes) for size in (solver.memory, solver.kept, *sizes)]
         task, seen = Task(), Compared()
         task.begin, task.end, task.frames = part.start, part.stop, count
-        task.iterations, task.forced = rule.iterations, int(weight is None)
+        task.iterations, task.forced = rule.end - rule.begin, int(state is None)
         task.soft_count, task.hinge_end = 0 if doubt is None else len(base), solver.driven
         seen.frames, seen.vertices, seen.joints, seen.activations = count, vertices, joints, activations
         seen.own_rest, seen.own_weights = int(len(rest) > 1), int(len(weights) > 1)
@@ -240,7 +243,7 @@ def descend(
         inputs = [
             task, seen, as_warp(solver.plan), as_warp(solver.numbers), as_rows(constants[0]),
             *map(as_rows, work[:2]), as_warp(solver.at), as_warp(rules),
-            sum(1 << step for step in rule.renewed), *(as_warp(one.view(-1)) for one in (columns, spins, base)),
+            sum(1 << step for step in made), rule.begin, *(as_warp(one.view(-1)) for one in (columns, spins, base)),
             *map(as_warp, tables.values()), *(as_warp(one.view(-1)) for one in given),
             *map(as_rows, work[2:]), *(as_warp(one.view(-1)) for one in out),
         ]  # fmt: skip

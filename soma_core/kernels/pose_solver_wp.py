@@ -148,11 +148,11 @@ class PoseSolver:
             place["damping"],
             place["activity"], counts["activation_count"], place["scale"], place["transform"],
             place["active"], place["before"], place["push"], place["pull"], place["gained"],
-            place["typical"], place["doubt_weight"],
+            place["typical"], place["gradient"], place["fresh"] - place["gradient"],
         )  # fmt: skip
         self.at = torch.tensor(at, dtype=torch.int32, device=device)
         self.memory, self.kept = sum(slots.values()), sum(kept.values())
-        self.driven, self.columns = d, c
+        self.driven, self.columns, self.under_way = d, c, at[-1]
         self._sent: dict[tuple[float, ...], Tensor] = {}
 
     def constants(self, *parts: Tensor) -> tuple[Tensor, bool]:
