@@ -118,6 +118,7 @@ class Refinement:
         typical: Tensor | None = None,
     ) -> None:
         self.model, self.problem, self.bound, self.typical = model, problem, bound, typical
+        self.state: Tensor | None = None
         self.doubt: TwistDoubt | None = None
         self.weight: Tensor | None = None
         self.mass = problem.weights.sum(1).expand(len(problem.vertices))
@@ -202,7 +203,7 @@ class Refinement:
 
         structure = model.structure
         unit = 1 / (float((structure.influence_weight**2).sum()) * _PIECE * len(structure.fitted))
-        damping, state = torch.full_like(self.mass, _START_DAMPING), None
+        damping, state = torch.full_like(self.mass, _START_DAMPING), self.state
         clip = None if self.bound is None or self.typical is None else (self.bound, self.typical)
         pose = out = replace(start, last_change=torch.full_like(self.mass, torch.inf))
         problem, rows, begin, end = self.problem, torch.arange(len(self.mass)), 0, min(at_once, iterations)
@@ -221,6 +222,8 @@ class Refinement:
                 accepted=pose.accepted + found.accepted.to(pose.accepted),
             )  # fmt: skip
             out = out.put(rows, pose)
+            whole = found.state if begin == 0 else whole.index_copy(0, rows, found.state)
+            self.state = whole
             still = torch.nonzero(found.change > 0).flatten()
             if end == iterations or not len(still):
                 return out

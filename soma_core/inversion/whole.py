@@ -134,6 +134,7 @@ def is_worse(second: Tensor, first: Tensor, weights: Tensor, robust: float) -> T
     return after > 1.1 * before + weights.sum(1) * _DOUBTFUL[0] ** 2
 
 
+INHERIT = True
 class WholeFit:
     """From a pose fitted to moments of skinning to the minimum of the whole model.
 
@@ -151,6 +152,7 @@ class WholeFit:
             ends = [variables.index(limb.end) for limb in coarse.share.limbs if limb.end in variables]
             self.ends = torch.tensor(ends, device=coarse.solver.variables.device)
 
+    refinement = None
     def __call__(self, targets: Targets, pose: Pose) -> tuple[Pose, Problem]:
         """The pose, its translation in the world, and the problem of the model.
 
@@ -163,8 +165,10 @@ class WholeFit:
         pose = replace(pose, translation=pose.translation - problem.origin)
         pose, clip = self._approached(problem, pose, targets.robust)
         pose = self._descended(self.coarse, problem, pose, clip)
+        keep = self.refinement
         if clip is None:
             pose = self._searched(problem, pose)
+        self.refinement = keep
         if self.coarse is not self.model:
             world = pose.translation + problem.origin
             problem = targets.problem(self.model)
@@ -257,6 +261,14 @@ class WholeFit:
         clips = () if clip is None else clip
         share = _RESTING_SHARE if model is self.model else _COARSE_SHARE
         refinement = Refinement(model, problem, *clips)
+        if INHERIT and model is self.model and model is not self.coarse and self.refinement is not None:
+            st = self.refinement.state.clone()
+            c = 3 * model._steps.columns + 3
+            k = (problem.weights.sum(1) / self.refinement.problem.weights.sum(1))[:, None]
+            st[:, 6*c:11*c] *= k
+            st[:, 11*c:11*c+5] /= k
+            refinement.state = st
+        self.refinement = refinement
         return refinement(
             pose, iterations=self.options.refreshes, tolerance=_RESTING, share=share,
             at_once=_AT_ONCE[model is not self.coarse],

@@ -17,11 +17,12 @@ BEGUN = (
     + """
     for (int i = 0; i < 9 * joint_count; i++) trial_relative[i] = relative[i];
     moving[0] = one; accepted[0] = zero;
-    if (again) return;
-    for (int i = 0; i < memory_; i++) past_inverse[i] = zero;
-    for (int i = 0; i < 2 * memory_ * size_; i++) past[i] = zero;
+    if (again > 1) return;
+    if (!again) for (int i = 0; i < memory_; i++) past_inverse[i] = zero;
+    if (!again) for (int i = 0; i < 2 * memory_ * size_; i++) past[i] = zero;
     for (int i = from_; i < size_; i++) gradient[i] = fresh[i];
     energy[0] = reached[0]; pressing[0] = pressing_next[0]; shrink[0] = one;
+    V more = reached[0] / mass[0] * growth; damping[0] = more > damping[0] ? more : damping[0];
 """
 )
 
@@ -83,8 +84,8 @@ DRAWN = (
     _RANGE
     + """
     for (int i = from_; i < size_; i++) slope[i] = gradient[i];
-    for (int q = 1; q <= count && q <= memory_; q++) {
-        int p = (count - q) % memory_; M s = past + p * size_; M y = past + (memory_ + p) * size_;
+    for (int p = 0; p < memory_; p++) {
+        M s = past + p * size_; M y = past + (memory_ + p) * size_;
         V sum = zero; for (int i = from_; i < size_; i++) sum += s[i] * slope[i];
         V part = sum * past_inverse[p];
         past_share[p] = part;
@@ -92,13 +93,13 @@ DRAWN = (
     }
 """
 )
-"""First half of the two loops of limited-memory BFGS."""
+"""First half of the two loops of limited-memory BFGS; the latest step is the first."""
 
 MIXED = (
     _RANGE
     + """
-    for (int q = count < memory_ ? count : memory_; q > 0; q--) {
-        int p = (count - q) % memory_; M s = past + p * size_; M y = past + (memory_ + p) * size_;
+    for (int p = memory_ - 1; p >= 0; p--) {
+        M s = past + p * size_; M y = past + (memory_ + p) * size_;
         V sum = zero; for (int i = from_; i < size_; i++) sum += y[i] * slope[i];
         V part = past_share[p] - sum * past_inverse[p];
         for (int i = from_; i < size_; i++) slope[i] += part * s[i];
@@ -149,15 +150,22 @@ ACCEPTED = (
         ((R*)&better)[n] = good; ((R*)&refused)[n] = ((R*)moving)[n] - good;
     }
     const V half = zero + R(0.5);
-    int p = count % memory_; M s = past + p * size_; M y = past + (memory_ + p) * size_;
+    for (int p = memory_ - 1; p > 0; p--) {
+        past_inverse[p] = better > half ? past_inverse[p-1] : past_inverse[p];
+        M s = past + p * size_; M y = past + (memory_ + p) * size_;
+        for (int i = from_; i < size_; i++) {
+            s[i] = better > half ? s[i-size_] : s[i]; y[i] = better > half ? y[i-size_] : y[i];
+        }
+    }
+    M s = past; M y = past + memory_ * size_;
     V product_ = zero, ss = zero, yy = zero;
     for (int i = from_; i < size_; i++) {
-        V a = better > half ? step[i] : zero, b = better > half ? fresh[i] - gradient[i] : zero;
+        V a = better > half ? step[i] : s[i], b = better > half ? fresh[i] - gradient[i] : y[i];
         s[i] = a; y[i] = b; product_ += a * b; ss += a * a; yy += b * b;
         gradient[i] = better > half ? fresh[i] : gradient[i];
     }
     V known = product_ > R(1e-6) * ROOT(ss) * ROOT(yy) ? one : zero;
-    past_inverse[p] = known > half ? one / (known > half ? product_ : one) : zero;
+    past_inverse[0] = known > half ? one / (known > half ? product_ : one) : zero;
     for (int i = 0; i < memory_; i++) past_inverse[i] = refused > half ? zero : past_inverse[i];
     #define KEEP(a, b, count) for (int i = 0; i < (count); i++) (a)[i] = better > half ? (a)[i] : (b)[i];
     KEEP(relative, trial_relative, 9 * joint_count)

@@ -22,7 +22,7 @@ _BARE = {
     "assemble": matrix.ASSEMBLE, "twists": matrix.TWISTS, "modes": matrix.MODES, "factor": matrix.FACTOR,
     "forces": text.FORCES, "solve": text.SOLVE, "selected": variance.SELECTED, "keep": view.KEEP,
     "transform": view.TRANSFORM, "activate": view.ACTIVATE, "pull": view.PULL, "turn": view.TURN,
-    "taken": descent.TAKEN,
+    "taken": descent.TAKEN, "drawn": descent.DRAWN,
 }  # fmt: skip
 """Bodies that take nothing but the lists and the memory."""
 
@@ -81,11 +81,9 @@ def solver_functions(scalar: str, lanes: int, *, shared: bool) -> SimpleNamespac
         plan: _ids, numbers: real, k: real, s: real, f: real, columns: _ids, squares: real, count: int
     ): ...  # fmt: skip
 
-    def begun(plan: _ids, numbers: real, k: real, s: real, f: real, again: int): ...
+    def begun(plan: _ids, numbers: real, k: real, s: real, f: real, again: int, growth: number): ...
 
-    def drawn(plan: _ids, numbers: real, k: real, s: real, f: real, count: int): ...
-
-    def mixed(plan: _ids, numbers: real, k: real, s: real, f: real, count: int, longest: number): ...
+    def mixed(plan: _ids, numbers: real, k: real, s: real, f: real, longest: number): ...
 
     def judged(
         plan: _ids, numbers: real, k: real, s: real, f: real, tolerance: number, share: number
@@ -93,7 +91,7 @@ def solver_functions(scalar: str, lanes: int, *, shared: bool) -> SimpleNamespac
         return 0
 
     def accepted(
-        plan: _ids, numbers: real, k: real, s: real, f: real, count: int, noise: number, floor_: number,
+        plan: _ids, numbers: real, k: real, s: real, f: real, noise: number, floor_: number,
         lower: number, raise_: number, least: number, most: number, shorten: number,
     ): ...  # fmt: skip
 
@@ -105,7 +103,7 @@ def solver_functions(scalar: str, lanes: int, *, shared: bool) -> SimpleNamespac
         "still": (text.STILL, root_turn), "doubt": (view.DOUBT, doubt), "given": (descent.GIVEN, given),
         "brought": (descent.BROUGHT, brought), "weighed": (descent.WEIGHED, weighed),
         "combined": (descent.COMBINED, combined), "doubted": (descent.DOUBTED, doubted),
-        "begun": (descent.BEGUN, begun), "drawn": (descent.DRAWN, drawn), "mixed": (descent.MIXED, mixed), "judged": (descent.JUDGED, judged),
+        "begun": (descent.BEGUN, begun), "mixed": (descent.MIXED, mixed), "judged": (descent.JUDGED, judged),
         "accepted": (descent.ACCEPTED, accepted),
     }  # fmt: skip
     for name, body in _BARE.items():

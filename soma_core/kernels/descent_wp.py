@@ -25,6 +25,10 @@ __all__ = ["Descended", "DescentRule", "descend"]
 
 _ids, _short = wp.array(dtype=wp.int32), wp.array(dtype=wp.int16)
 
+_GROWTH = 40.0
+"""Relative damping of the first steps over the mean square error that is left [1/m^2]: what curves by that error
+is not in the matrix."""
+
 _SHORTEN = 0.3
 """Factor of a step that would have raised the error."""
 
@@ -50,7 +54,7 @@ def _kernel(scalar: str, width: int, *, shared: bool):
     @wp.kernel(module=module, enable_backward=False)
     def descent(
         task: Task, seen: Compared, plan: _ids, numbers: real, constants: rows, memory: rows, kept: rows,
-        at: _ids, rules: real, renewed: int, done: int, columns: _ids, spins: real, base: real,
+        at: _ids, rules: real, renewed: int, columns: _ids, spins: real, base: real,
         skin_start: _ids, skin_joint: _short, skin_value: real,
         joint_run: _ids, joint_id: _short, joint_start: _ids, joint_row: _short, joint_value: real,
         move_start: _ids, move_id: _short, move_value: real,
@@ -72,7 +76,7 @@ def _kernel(scalar: str, width: int, *, shared: bool):
             load(mass, wp.int64(1), 0, 1, f, last, s, at[4])
             load(damping, wp.int64(1), 0, 1, f, last, s, at[18])
             load(scale, wp.int64(1), 0, 1, f, last, s, at[21])
-            load(state, wp.int64(at[30]), 0, at[30] * (1 - task.forced), f, last, s, at[29])
+            load(state, wp.int64(at[30]), 0, at[30] * wp.min(task.outcome, 1), f, last, s, at[29])
             load(origin, wp.int64(3), 0, 3, f, last, tile, at_origin)
             load(scale, wp.int64(1), 0, 1, f, last, tile, at_scale)
             if seen.clipped > 0:
@@ -105,10 +109,10 @@ def _kernel(scalar: str, width: int, *, shared: bool):
                     doubt(plan, numbers, k, s, m, columns, spins, square, count)
                     combined(plan, numbers, k, s, m, seen.clipped)
                 if step == 0:
-                    begun(plan, numbers, k, s, m, 1 - task.forced)
+                    begun(plan, numbers, k, s, m, task.outcome, rules[12])
                 else:
                     accepted(
-                        plan, numbers, k, s, m, done + step - 1, rules[4], rules[5], rules[6], rules[7], rules[8],
+                        plan, numbers, k, s, m, rules[4], rules[5], rules[6], rules[7], rules[8],
                         rules[9], rules[10],
                     )  # fmt: skip
                 if (renewed >> step) & 1 > 0:
@@ -119,9 +123,9 @@ def _kernel(scalar: str, width: int, *, shared: bool):
                         modes(plan, numbers, k, s, m)
                     doubted(plan, numbers, k, s, m, columns, square, count)
                     factor(plan, numbers, k, s, m)
-                drawn(plan, numbers, k, s, m, done + step)
+                drawn(plan, numbers, k, s, m)
                 solve(plan, numbers, k, s, m)
-                mixed(plan, numbers, k, s, m, done + step, rules[11])
+                mixed(plan, numbers, k, s, m, rules[11])
                 if judged(plan, numbers, k, s, m, rules[0], rules[1]) == 0:
                     break
                 if step < task.iterations:
@@ -203,7 +207,8 @@ def descend(
         damping, mass, scale: (F,).
         targets, origin: (F, v, 3) and (F, 3) [m].
         clip: lengths (F,) beyond which residuals count linearly, and typical ones; None for least squares.
-        state: of an earlier descent of these frames, which this one goes on with; None begins anew.
+        state: of an earlier descent of these frames, which this one goes on with; where it begins anew, only
+            its memory of steps counts. None without.
     """
     count, vertices = targets.shape[:2]
     lanes, scalar = lane_count(targets), scalar_name(targets.dtype)
@@ -213,7 +218,7 @@ def descend(
     columns, spins, base = (torch.zeros(1, dtype=torch.int32), none, none) if doubt is None else doubt
     rules = targets.new_tensor([
         rule.tolerance, rule.share, rule.unit, rule.least, rule.noise, rule.floor, rule.lower, rule.raised,
-        rule.least_raised, rule.most, _SHORTEN, rule.longest,
+        rule.least_raised, rule.most, _SHORTEN, rule.longest, _GROWTH,
     ])  # fmt: skip
     out = Descended(
         torch.empty_like(relative, memory_format=torch.contiguous_format), new(count, 3), new(count),
@@ -235,7 +240,8 @@ def descend(
         work = [working_rows(targets, 1, size, lanes) for size in (solver.memory, solver.kept, *sizes)]
         task, seen = Task(), Compared()
         task.begin, task.end, task.frames = part.start, part.stop, count
-        task.iterations, task.forced = rule.end - rule.begin, int(state is None)
+        again = (0 if state is None else 1) if rule.begin == 0 else 2
+        task.iterations, task.forced, task.outcome = rule.end - rule.begin, int(again < 2), again
         task.soft_count, task.hinge_end = 0 if doubt is None else len(base), solver.driven
         seen.frames, seen.vertices, seen.joints, seen.activations = count, vertices, joints, activations
         seen.own_rest, seen.own_weights = int(len(rest) > 1), int(len(weights) > 1)
@@ -243,7 +249,7 @@ def descend(
         inputs = [
             task, seen, as_warp(solver.plan), as_warp(solver.numbers), as_rows(constants[0]),
             *map(as_rows, work[:2]), as_warp(solver.at), as_warp(rules),
-            sum(1 << step for step in made), rule.begin, *(as_warp(one.view(-1)) for one in (columns, spins, base)),
+            sum(1 << step for step in made), *(as_warp(one.view(-1)) for one in (columns, spins, base)),
             *map(as_warp, tables.values()), *(as_warp(one.view(-1)) for one in given),
             *map(as_rows, work[2:]), *(as_warp(one.view(-1)) for one in out),
         ]  # fmt: skip
