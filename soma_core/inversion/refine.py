@@ -188,6 +188,11 @@ class Refinement:
                 solve = here._again(solve, refused, pose, view, damping)
         return out.put(rows, pose)
 
+    def remember(self, before: Refinement) -> None:
+        """Begin with the earlier steps of a descent on another model of the same poses."""
+        if before.state is not None:
+            self.state = self.model.converted(before.state, self.mass / before.mass)
+
     def _in_lanes(
         self, start: Pose, iterations: int, tolerance: float, share: float, at_once: int
     ) -> Pose | None:

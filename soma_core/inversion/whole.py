@@ -134,7 +134,6 @@ def is_worse(second: Tensor, first: Tensor, weights: Tensor, robust: float) -> T
     return after > 1.1 * before + weights.sum(1) * _DOUBTFUL[0] ** 2
 
 
-INHERIT = True
 class WholeFit:
     """From a pose fitted to moments of skinning to the minimum of the whole model.
 
@@ -152,7 +151,6 @@ class WholeFit:
             ends = [variables.index(limb.end) for limb in coarse.share.limbs if limb.end in variables]
             self.ends = torch.tensor(ends, device=coarse.solver.variables.device)
 
-    refinement = None
     def __call__(self, targets: Targets, pose: Pose) -> tuple[Pose, Problem]:
         """The pose, its translation in the world, and the problem of the model.
 
@@ -164,17 +162,15 @@ class WholeFit:
         steps = pose.accepted
         pose = replace(pose, translation=pose.translation - problem.origin)
         pose, clip = self._approached(problem, pose, targets.robust)
-        pose = self._descended(self.coarse, problem, pose, clip)
-        keep = self.refinement
+        pose, way = self._descended(self.coarse, problem, pose, clip)
         if clip is None:
             pose = self._searched(problem, pose)
-        self.refinement = keep
         if self.coarse is not self.model:
             world = pose.translation + problem.origin
             problem = targets.problem(self.model)
             pose = replace(pose, translation=world - problem.origin)
             if clip is None:  # else few vertices tell well enough which of all are wrong
-                pose = self._descended(self.model, problem, pose, None)
+                pose, _ = self._descended(self.model, problem, pose, None, way)
         accepted = steps + pose.accepted
         return replace(pose, translation=pose.translation + problem.origin, accepted=accepted), problem
 
@@ -256,23 +252,21 @@ class WholeFit:
         assert distances is not None
         return _clip(distances, problem.weights, robust)
 
-    def _descended(self, model: PoseModel, problem: Problem, pose: Pose, clip: _Clip | None) -> Pose:
-        """Descent on the model."""
+    def _descended(
+        self, model: PoseModel, problem: Problem, pose: Pose, clip: _Clip | None,
+        before: Refinement | None = None,
+    ) -> tuple[Pose, Refinement]:  # fmt: skip
+        """Descent on the model, which goes on with what one `before` remembers."""
         clips = () if clip is None else clip
         share = _RESTING_SHARE if model is self.model else _COARSE_SHARE
         refinement = Refinement(model, problem, *clips)
-        if INHERIT and model is self.model and model is not self.coarse and self.refinement is not None:
-            st = self.refinement.state.clone()
-            c = 3 * model._steps.columns + 3
-            k = (problem.weights.sum(1) / self.refinement.problem.weights.sum(1))[:, None]
-            st[:, 6*c:11*c] *= k
-            st[:, 11*c:11*c+5] /= k
-            refinement.state = st
-        self.refinement = refinement
-        return refinement(
+        if before is not None:
+            refinement.remember(before)
+        pose = refinement(
             pose, iterations=self.options.refreshes, tolerance=_RESTING, share=share,
             at_once=_AT_ONCE[model is not self.coarse],
         )  # fmt: skip
+        return pose, refinement
 
     def _searched(self, problem: Problem, pose: Pose) -> Pose:
         """Frames that may rest beside their minimum are tried from other limb twists."""
@@ -294,7 +288,7 @@ class WholeFit:
             angle = relative.new_tensor(tried).repeat_interleave(len(rows))
             for limb in limbs:
                 share.turn(relative, limb, angle)
-            trial = self._descended(self.coarse, part, replace(old, relative=relative), None)
+            trial, _ = self._descended(self.coarse, part, replace(old, relative=relative), None)
             _, reached = self.coarse.distances(part, trial, energy_only=True)
             least, which = reached.view(len(tried), -1).min(0)
             better = least < 0.9 * energy[rows]
