@@ -26,7 +26,7 @@ __all__ = ["Ladder"]
 _STARTS = ("procrustes", "transfer")
 
 _ON_THE_WAY = 1e-3
-"""Tolerance of steps on moments where the whole model is fitted after them [m]: offsets move more than that."""
+"""Tolerance of steps on moments where the whole model is fitted after them [m]: offsets move more."""
 
 
 class Ladder(torch.nn.Module):

@@ -121,7 +121,7 @@ class PoseModel(SkinModel):
     @property
     def frame_bytes(self) -> int:
         """What a frame takes in a fit by kernels on a GPU, its targets among it."""
-        solver = 0 if self._steps is None else self._steps.memory + 2 * self._steps.kept
+        solver = 0 if self.steps is None else self.steps.memory + 2 * self.steps.kept
         vertices = 9 * len(self.fitted)  # targets, some of them once more, distances and their marks
         return (solver + vertices + 8192) * self.solver.eye.element_size()
 

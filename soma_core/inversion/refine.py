@@ -14,9 +14,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from soma_core.inversion.descent import converted, descended, knows_descent
+from soma_core.inversion.gauss_newton import LONGEST_STEP
 from soma_core.inversion.priors import JointTerms, TwistDoubt
 from soma_core.inversion.problem import Pose, Problem, View
-from soma_core.inversion.gauss_newton import LONGEST_STEP
 from soma_core.inversion.protocol import ForwardModel
 
 __all__ = ["Refinement", "clumping"]
@@ -32,9 +33,6 @@ bad one, largest."""
 _EARLY, _EVERY = (0, 1, 3, 5), (5, 3)
 """Steps at which the matrix is made anew: the first ones, and those that leave the second of these numbers
 when divided by the first. In between, the memory makes up for what changes."""
-
-_AT_ONCE = 2
-"""Steps that a kernel takes, after its first ones, before those frames that still move are brought together."""
 
 _CROWDED = 0.75
 """Share of frames that still move from which those that rest are carried along."""
@@ -100,6 +98,12 @@ def clumping(model: ForwardModel, view: View, mass: Tensor) -> Tensor:
     return (pieces / (_PIECE * len(structure.fitted))).clamp_max(1)
 
 
+def _unit(model: ForwardModel) -> float:
+    """Clumping of forces of 1 m^2, where what is left is as much a vertex."""
+    structure = model.structure
+    return 1 / (float((structure.influence_weight**2).sum()) * _PIECE * len(structure.fitted))
+
+
 class Refinement:
     """Lowers the error of a model from a pose; never raises it.
 
@@ -136,9 +140,19 @@ class Refinement:
             share: or below this share of the error that is left.
             at_once: steps that all frames take together, as most of them need.
         """
-        found = self._in_lanes(start, iterations, tolerance, share, at_once)
-        if found is not None:
-            return found
+        if knows_descent(self.model, self.problem):
+            from soma_core.kernels.descent_wp import DescentRule
+
+            rule = DescentRule(
+                tolerance=tolerance, share=share, unit=_unit(self.model), noise=_NOISE[self.mass.dtype],
+                floor=_FLOOR[self.mass.dtype] ** 2, damping=_START_DAMPING, lower=_LOWER, raised=_RAISE,
+                least_raised=_LEAST_RAISED, most=_MOST_DAMPING, longest=LONGEST_STEP,
+            )  # fmt: skip
+            pose, self.state = descended(
+                self.model, self.problem, start, rule, self.bound, self.typical, self.state, renewed=_renewed,
+                iterations=iterations, at_once=at_once,
+            )  # fmt: skip
+            return pose
         solver, here, pose, out = self.model.solver, self, start, start
         view = self._first_view(start)
         rows = torch.arange(len(self.mass), device=self.mass.device)
@@ -191,53 +205,7 @@ class Refinement:
     def remember(self, before: Refinement) -> None:
         """Begin with the earlier steps of a descent on another model of the same poses."""
         if before.state is not None:
-            self.state = self.model.converted(before.state, self.mass / before.mass)
-
-    def _in_lanes(
-        self, start: Pose, iterations: int, tolerance: float, share: float, at_once: int
-    ) -> Pose | None:
-        """The same by a kernel that takes groups of frames through many steps; None where there is none.
-
-        Those that still move are brought together from time to time, and begin anew where they are.
-        """
-        model, dtype = self.model, self.mass.dtype
-        descend = getattr(model, "descend", None)
-        if descend is None:
-            return None
-        from soma_core.kernels.descent_wp import DescentRule
-
-        structure = model.structure
-        unit = 1 / (float((structure.influence_weight**2).sum()) * _PIECE * len(structure.fitted))
-        damping, state = torch.full_like(self.mass, _START_DAMPING), self.state
-        clip = None if self.bound is None or self.typical is None else (self.bound, self.typical)
-        pose = out = replace(start, last_change=torch.full_like(self.mass, torch.inf))
-        problem, rows, begin, end = self.problem, torch.arange(len(self.mass)), 0, min(at_once, iterations)
-        while True:
-            rule = DescentRule(
-                begin=begin, end=end, renewed=tuple(filter(_renewed, range(begin, end + 1))), unit=unit,
-                tolerance=tolerance, share=share, least=torch.finfo(dtype).tiny, noise=_NOISE[dtype],
-                floor=_FLOOR[dtype] ** 2, lower=_LOWER, raised=_RAISE, least_raised=_LEAST_RAISED,
-                most=_MOST_DAMPING, longest=LONGEST_STEP,
-            )  # fmt: skip
-            found = descend(problem, pose, rule, doubt=problem.doubt, clip=clip, damping=damping, state=state)
-            if found is None:
-                return None
-            pose = Pose(
-                relative=found.relative, translation=found.hips, last_change=found.change,
-                accepted=pose.accepted + found.accepted.to(pose.accepted),
-            )  # fmt: skip
-            out = out.put(rows, pose)
-            whole = found.state if begin == 0 else whole.index_copy(0, rows, found.state)
-            self.state = whole
-            still = torch.nonzero(found.change > 0).flatten()
-            if end == iterations or not len(still):
-                return out
-            if len(still) < len(rows):
-                still = problem.several(still)
-                rows, problem, pose = rows[still], problem.part(still), pose.part(still)
-                clip = None if clip is None else (clip[0][still], clip[1][still])
-            damping, state = found.damping[still], found.state[still]
-            begin, end = end, min(end + _AT_ONCE, iterations)
+            self.state = converted(before.state, self.mass / before.mass)
 
     def part(self, rows: Tensor) -> Refinement:
         """The same of some frames, where their doubt of twists is settled."""

@@ -31,7 +31,6 @@ from soma_core.rig.skeleton import Rig
 from soma_core.skeleton.identity import Identity
 
 if TYPE_CHECKING:
-    from soma_core.kernels.descent_wp import Descended, DescentRule
     from soma_core.kernels.pose_solver_wp import Factor, PoseSolver
 
 __all__ = ["Kind", "SkinModel"]
@@ -60,8 +59,12 @@ class SkinModel(torch.nn.Module):
 
     Attributes:
         moments, solver, start: of the rig; driven joints are joints of it.
+        steps: kernels of the whole model; None without.
+        linear: whether the offsets are all that a pose adds to skinning.
         fitted: (v,) bool, vertices that take part by default.
     """
+
+    linear = True
 
     def __init__(
         self,
@@ -86,7 +89,7 @@ class SkinModel(torch.nn.Module):
             structure, public_count=self.solver.public_count, limbs=limbs, warp=warp, **kind
         )
         self._warp, self._kind, self._skin = warp, kind, rig.skin
-        self._steps = self._step_kernels() if self.solver.kernels is not None else None
+        self.steps = self._step_kernels() if self.solver.kernels is not None else None
         orient = rig.t_pose_world[:, :3, :3].copy()
         orient[0] = np.eye(3)
         self.orient = constant(orient, **kind)
@@ -111,7 +114,7 @@ class SkinModel(torch.nn.Module):
         twin._kind = {**self._kind, "dtype": torch.float64}
         for made in ("skin", "residual"):
             twin.__dict__.pop(made, None)
-        twin._steps = None
+        twin.steps = None
         return twin
 
     def _step_kernels(self) -> PoseSolver:
@@ -189,10 +192,10 @@ class SkinModel(torch.nn.Module):
         rest, joints = problem.rest, self.moments.joints
         assert found.forces is not None
         assert rest.bind is not None
-        if self._steps is not None:
+        if self.steps is not None:
             rising = None if activity is None else activity.rising
-            return self._steps.slopes(
-                self._constants(rest), pose.relative, pose.translation, found.forces, found.pull, rising
+            return self.steps.slopes(
+                self.constants(rest), pose.relative, pose.translation, found.forces, found.pull, rising
             )
         bind, forces = rest.bind[:, joints], found.forces[:, joints]
         about = forces[..., :3] - forces[..., 3:] * bind[..., None, :, 3]
@@ -207,28 +210,28 @@ class SkinModel(torch.nn.Module):
     def doubted(self, doubt: TwistDoubt, relative: Tensor, turns: Tensor) -> tuple[Tensor, Tensor]:
         """A doubt's share (F,) and half its derivative (F, n + 1, 3) at local rotations and world turns."""
         n = self.solver.variables
-        if self._steps is None:
+        if self.steps is None:
             rotations = relative[:, n]
             slope = doubt.slope(rotations, turns[:, self.solver.parents[n]])
             return doubt.share(rotations), torch.nn.functional.pad(slope, (0, 0, 0, 1))
         columns = self.solver.columns(doubt.variable)
-        return self._steps.doubted(relative, turns, columns, doubt.axis, doubt.square.view(-1, len(columns)))
+        return self.steps.doubted(relative, turns, columns, doubt.axis, doubt.square.view(-1, len(columns)))
 
     def moved(self, problem: Problem, pose: Pose, turns: Tensor, step: Tensor) -> Pose:
         """Poses after a step (F, n + 1, 3) of :meth:`inverse`; `turns` are the world's before it."""
-        if self._steps is None:
+        if self.steps is None:
             return self.solver.retract(pose, turns, step)
-        constants = self._constants(problem.rest)
-        relative, hips = self._steps.moved(
+        constants = self.constants(problem.rest)
+        relative, hips = self.steps.moved(
             constants, pose.relative, pose.translation, step, longest=LONGEST_STEP
         )
         return replace(pose, relative=relative, translation=hips)
 
     def walk(self, pose: Pose, rest: RestMoments) -> tuple[Tensor, Tensor]:
         """World turns (F, J', 3, 3) and places (F, J', 3) of all joints, twist joints too."""
-        if self._steps is None:
+        if self.steps is None:
             return self.solver.walk(pose, rest)
-        return self._steps.walked(self._constants(rest), pose.relative, pose.translation)
+        return self.steps.walked(self.constants(rest), pose.relative, pose.translation)
 
     def distances(
         self, problem: Problem, pose: Pose, *, energy_only: bool = False
@@ -242,12 +245,12 @@ class SkinModel(torch.nn.Module):
         self, problem: Problem, pose: Pose
     ) -> tuple[Tensor, Tensor, Activity | None, tuple[Tensor | None, ...]]:
         """Turns and places of all joints, activations, and what :class:`ModelResidual` takes."""
-        if self._steps is None:
+        if self.steps is None:
             turns, places = self.solver.walk(pose, problem.rest)
             activity = None if self.offsets is None else self.offsets.activity(pose.relative)
             return turns, places, activity, self.posing(problem, turns, places, activity)
-        constants = self._constants(problem.rest)
-        turns, places, transforms, value, before, rising = self._steps.posed(
+        constants = self.constants(problem.rest)
+        turns, places, transforms, value, before, rising = self.steps.posed(
             constants, pose.relative, pose.translation
         )
         activity = None
@@ -287,31 +290,11 @@ class SkinModel(torch.nn.Module):
             damping: (F,) relative to the diagonal.
             mass: (F,) sums of the vertex weights.
         """
-        if self._steps is None:
+        if self.steps is None:
             matrix = self._with_terms(problem, pose, view.turns, view.places, view.activity, mass)
             return damped_inverse(matrix, damping)
-        steps, factor = self._steps, self._factor(problem, pose, view.activity, damping, mass)
+        steps, factor = self.steps, self._factor(problem, pose, view.activity, damping, mass)
         return lambda slope: steps.solve(factor, slope)
-
-    def descend(
-        self, problem: Problem, pose: Pose, rule: DescentRule, *, doubt: TwistDoubt | None,
-        clip: tuple[Tensor, Tensor] | None, damping: Tensor, state: Tensor | None,
-    ) -> Descended | None:  # fmt: skip
-        """Poses after a whole descent by kernels; None where they do not know it: on a GPU, and with terms."""
-        if self._steps is None or pose.relative.is_cuda or problem.terms is not None:
-            return None
-        from soma_core.kernels.descent_wp import descend
-
-        known = None
-        if doubt is not None:
-            known = self.solver.columns(doubt.variable), doubt.axis.contiguous(), doubt.square
-        frames = len(pose.translation)
-        return descend(
-            self._steps, self._constants(problem.rest), self.residual.tables, rule, known,
-            problem.identity.rest, problem.weights, pose.relative, pose.translation, damping,
-            problem.weights.sum(1).expand(frames), self.scale(problem).expand(frames), problem.vertices,
-            problem.origin, clip, state,
-        )  # fmt: skip
 
     def angle_variance(self, problem: Problem, pose: Pose) -> Tensor:
         """Mean square angle (F, n) [rad^2] of each variable's own turn under vertex noise of variance 1 m^2.
@@ -336,9 +319,9 @@ class SkinModel(torch.nn.Module):
         self, problem: Problem, pose: Pose, activity: Activity | None, mass: Tensor, damping: float = 0.0
     ) -> Tensor:
         """The same for weights of one on average; NaN for frames whose matrix is not positive definite."""
-        if self._steps is not None:
+        if self.steps is not None:
             damped = torch.full_like(mass, damping)
-            found = self._steps.variances(self._factor(problem, pose, activity, damped, mass))
+            found = self.steps.variances(self._factor(problem, pose, activity, damped, mass))
             return found.where(found.amax(1, keepdim=True) < _INDEFINITE, torch.nan)
         dense = self._with_terms(problem, pose, *self.walk(pose, problem.rest), activity, mass)
         dense = dense.flatten(3, 4).flatten(1, 2)
@@ -352,16 +335,16 @@ class SkinModel(torch.nn.Module):
         self, problem: Problem, pose: Pose, activity: Activity | None, damping: Tensor, mass: Tensor
     ) -> Factor:
         """The damped matrix, terms included, factorised by kernels."""
-        assert self._steps is not None
+        assert self.steps is not None
         slope = scale = None
         if activity is not None:
             slope, scale = activity.rising, self.scale(problem).expand(len(mass))
-        return self._steps.factorise(
-            self._constants(problem.rest), pose.relative, pose.translation, damping, mass, slope, scale,
+        return self.steps.factorise(
+            self.constants(problem.rest), pose.relative, pose.translation, damping, mass, slope, scale,
             stiffness=HINGE_STIFFNESS, soft=self.solver.soft(problem.terms, pose.translation),
         )  # fmt: skip
 
-    def _constants(self, rest: RestMoments) -> tuple[Tensor, bool]:
+    def constants(self, rest: RestMoments) -> tuple[Tensor, bool]:
         """What kernels take of identities."""
         made_of = (rest.second, rest.own, rest.offsets)
         known = rest.memo.get(self)

@@ -10,7 +10,9 @@ __all__ = ["ACCEPTED", "BEGUN", "BROUGHT", "COMBINED", "DOUBTED", "DRAWN", "GIVE
 MEMORY = 5
 """Earlier steps that a new one is made from."""
 
-_RANGE = f"const int from_ = 3 * driven_count, size_ = 3 * column_count + 3; constexpr int memory_ = {MEMORY};\n"
+_RANGE = (
+    f"const int from_ = 3 * driven_count, size_ = 3 * column_count + 3; constexpr int memory_ = {MEMORY};\n"
+)
 
 BEGUN = (
     _RANGE

@@ -6,13 +6,14 @@ shorter, where the twin damps the frame's matrix anew.
 """
 
 import functools
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import torch
 import warp as wp
 from torch import Tensor
 
+from soma_core.kernels._descent_text import MEMORY
 from soma_core.kernels._lanes import as_rows, in_threads, lane_count, launch, row_of, working_rows
 from soma_core.kernels._native import transposing
 from soma_core.kernels._residual_phases import TILE, phases, tile_slots
@@ -21,7 +22,7 @@ from soma_core.kernels._solver_functions import Task, solver_functions
 from soma_core.kernels.model_residual_wp import Compared, gathering, skinning
 from soma_core.kernels.pose_solver_wp import PoseSolver
 
-__all__ = ["Descended", "DescentRule", "descend"]
+__all__ = ["Descended", "DescentRule", "descend", "remembered"]
 
 _ids, _short = wp.array(dtype=wp.int32), wp.array(dtype=wp.int16)
 
@@ -145,24 +146,19 @@ class DescentRule(NamedTuple):
     """How a descent goes on; names are those of ``inversion.refine``.
 
     Attributes:
-        begin, end: steps that are taken, counted from the first look.
-        renewed: steps at which the matrix is made, beside the first.
         tolerance, share: where frames rest, [m] and relative.
-        unit, least: factor of the clumps, and the least error they are measured by.
+        unit: factor of the clumps that doubt is weighed by.
         noise, floor: relative and absolute rounding of an error, [m^2] for a mass of one.
-        lower, raised, least_raised, most: of the damping.
+        damping, lower, raised, least_raised, most: of the damping.
         longest: largest turn of a joint [rad].
     """
 
-    begin: int
-    end: int
-    renewed: tuple[int, ...]
     tolerance: float
     share: float
     unit: float
-    least: float
     noise: float
     floor: float
+    damping: float
     lower: float
     raised: float
     least_raised: float
@@ -193,7 +189,7 @@ def descend(
     solver: PoseSolver, constants: tuple[Tensor, bool], tables: Mapping[str, Tensor], rule: DescentRule,
     doubt: tuple[Tensor, Tensor, Tensor] | None, rest: Tensor, weights: Tensor, relative: Tensor,
     hips: Tensor, damping: Tensor, mass: Tensor, scale: Tensor, targets: Tensor, origin: Tensor,
-    clip: tuple[Tensor, Tensor] | None, state: Tensor | None,
+    clip: Tensor | None, state: Tensor | None, *, begin: int, end: int, renewed: Sequence[int],
 ) -> Descended:  # fmt: skip
     """Lower the error of F frames.
 
@@ -206,9 +202,12 @@ def descend(
         relative, hips: where to begin.
         damping, mass, scale: (F,).
         targets, origin: (F, v, 3) and (F, 3) [m].
-        clip: lengths (F,) beyond which residuals count linearly, and typical ones; None for least squares.
+        clip: lengths beyond which residuals count linearly, and typical ones (2, F) [m]; None for least
+            squares.
         state: of an earlier descent of these frames, which this one goes on with; where it begins anew, only
             its memory of steps counts. None without.
+        begin, end: steps that are taken, counted from the first look.
+        renewed: those at which the matrix is made, beside the first.
     """
     count, vertices = targets.shape[:2]
     lanes, scalar = lane_count(targets), scalar_name(targets.dtype)
@@ -217,14 +216,14 @@ def descend(
     none = targets.new_zeros(1)
     columns, spins, base = (torch.zeros(1, dtype=torch.int32), none, none) if doubt is None else doubt
     rules = targets.new_tensor([
-        rule.tolerance, rule.share, rule.unit, rule.least, rule.noise, rule.floor, rule.lower, rule.raised,
+        rule.tolerance, rule.share, rule.unit, torch.finfo(targets.dtype).tiny, rule.noise, rule.floor, rule.lower, rule.raised,
         rule.least_raised, rule.most, _SHORTEN, rule.longest, _GROWTH,
     ])  # fmt: skip
     out = Descended(
         torch.empty_like(relative, memory_format=torch.contiguous_format), new(count, 3), new(count),
         new(count), new(count), new(count, solver.under_way),
     )  # fmt: skip
-    made = {0, *(step - rule.begin for step in rule.renewed if rule.begin <= step <= rule.end)}
+    made = {0, *(step - begin for step in renewed)}
     bound, typical = (none, none) if clip is None else clip
     given = [
         rest, weights, relative, hips, damping, mass, scale, targets, origin, bound, typical,
@@ -240,8 +239,8 @@ def descend(
         work = [working_rows(targets, 1, size, lanes) for size in (solver.memory, solver.kept, *sizes)]
         task, seen = Task(), Compared()
         task.begin, task.end, task.frames = part.start, part.stop, count
-        again = (0 if state is None else 1) if rule.begin == 0 else 2
-        task.iterations, task.forced, task.outcome = rule.end - rule.begin, int(again < 2), again
+        again = (0 if state is None else 1) if begin == 0 else 2
+        task.iterations, task.forced, task.outcome = end - begin, int(again < 2), again
         task.soft_count, task.hinge_end = 0 if doubt is None else len(base), solver.driven
         seen.frames, seen.vertices, seen.joints, seen.activations = count, vertices, joints, activations
         seen.own_rest, seen.own_weights = int(len(rest) > 1), int(len(weights) > 1)
@@ -257,3 +256,9 @@ def descend(
 
     in_threads(run, -(-count // lanes), targets)
     return out
+
+
+def remembered(size: int) -> tuple[slice, slice]:
+    """Where in a state of `size` numbers the changes of slopes lie, and the inverse products with the steps."""
+    width = (size - MEMORY - 4) // (1 + 2 * MEMORY)
+    return slice((1 + MEMORY) * width, (1 + 2 * MEMORY) * width), slice(size - MEMORY - 4, size - 4)

@@ -259,7 +259,7 @@ def test_activations_squash_like_the_reference(dtype):
     identity = model.seen(SomaLayer(layer.backend, lod=layer.mesh.lod, dtype=dtype).identity())
     rest = model.rest(identity, torch.ones(1, len(model.fitted), dtype=dtype))
     relative = axis_angle_to_matrix(1.2 * randn(64, len(layer.rig.parents), 3, seed=4).to(dtype))
-    _, _, _, value, before, slope = model._steps.posed(model._constants(rest), relative, relative[:, 0, 0])
+    _, _, _, value, before, slope = model.steps.posed(model.constants(rest), relative, relative[:, 0, 0])
     expected = torch.tanh(torch.relu(before.double()))
     assert before.max() > 2
     rounding = 4 * torch.finfo(dtype).eps
@@ -335,7 +335,7 @@ def factor_of(kind, given):
     mass = one.weights.sum(1).expand(len(pose.translation))
     activity = None if model.offsets is None else model.offsets.activity(pose.relative)
     factor = model._factor(one, pose, activity, torch.zeros_like(mass), mass)
-    return model._steps, factor
+    return model.steps, factor
 
 
 @pytest.mark.parametrize("held", [False, True], ids=["free", "terms and hinges"])
