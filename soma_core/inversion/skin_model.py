@@ -59,8 +59,7 @@ class SkinModel(torch.nn.Module):
 
     Attributes:
         moments, solver, start: of the rig; driven joints are joints of it.
-        steps: kernels of the whole model; None without.
-        linear: whether the offsets are all that a pose adds to skinning.
+        steps, linear: kernels of the whole model, or None; whether offsets are all that it adds to skinning.
         fitted: (v,) bool, vertices that take part by default.
     """
 

@@ -1,11 +1,11 @@
 """Native bodies of a descent on the whole model, between those of the solver and of the model's residual.
 
-Names are those of :func:`soma_core.kernels._solver_text.prelude`. A pose that is looked at takes the place of the
-current one, which is kept as the trial until it is known to be worse.
+Names are those of :func:`soma_core.kernels._solver_text.prelude`. A pose that is looked at takes the place of
+the current one, which is kept as the trial until it is known to be worse.
 """
 
-__all__ = ["ACCEPTED", "BEGUN", "BROUGHT", "COMBINED", "DOUBTED", "DRAWN", "GIVEN", "JUDGED", "MEMORY", "MIXED",
-           "TAKEN", "WEIGHED"]  # fmt: skip
+__all__ = ["ACCEPTED", "BEGUN", "BROUGHT", "COMBINED", "DOUBTED", "DRAWN", "GIVEN", "JUDGED", "MEMORY",
+           "MIXED", "TAKEN", "WEIGHED"]  # fmt: skip
 
 MEMORY = 5
 """Earlier steps that a new one is made from."""

@@ -1,8 +1,8 @@
 """Descent on the error of a whole model in Warp, from the first look at the vertices to the last step.
 
-The twin of ``inversion.refine.Refinement`` on a CPU and without terms: a group of frames goes through all of
-its steps at once, and nothing returns to Python between them. A step that would raise the error is tried again
-shorter, where the twin damps the frame's matrix anew.
+The twin of ``inversion.refine.Refinement`` on a CPU and without terms: a group of frames goes through
+many steps at once, and nothing returns to Python between them. A step that would raise the error is tried
+again shorter, where the twin damps the frame's matrix anew.
 """
 
 import functools
@@ -27,8 +27,8 @@ __all__ = ["Descended", "DescentRule", "descend", "remembered"]
 _ids, _short = wp.array(dtype=wp.int32), wp.array(dtype=wp.int16)
 
 _GROWTH = 40.0
-"""Relative damping of the first steps over the mean square error that is left [1/m^2]: what curves by that error
-is not in the matrix."""
+"""Relative damping of the first steps over the mean square error that is left [1/m^2]: the matrix does not know
+what curves by that error."""
 
 _SHORTEN = 0.3
 """Factor of a step that would have raised the error."""
@@ -216,8 +216,8 @@ def descend(
     none = targets.new_zeros(1)
     columns, spins, base = (torch.zeros(1, dtype=torch.int32), none, none) if doubt is None else doubt
     rules = targets.new_tensor([
-        rule.tolerance, rule.share, rule.unit, torch.finfo(targets.dtype).tiny, rule.noise, rule.floor, rule.lower, rule.raised,
-        rule.least_raised, rule.most, _SHORTEN, rule.longest, _GROWTH,
+        rule.tolerance, rule.share, rule.unit, torch.finfo(targets.dtype).tiny, rule.noise, rule.floor,
+        rule.lower, rule.raised, rule.least_raised, rule.most, _SHORTEN, rule.longest, _GROWTH,
     ])  # fmt: skip
     out = Descended(
         torch.empty_like(relative, memory_format=torch.contiguous_format), new(count, 3), new(count),
@@ -259,6 +259,6 @@ def descend(
 
 
 def remembered(size: int) -> tuple[slice, slice]:
-    """Where in a state of `size` numbers the changes of slopes lie, and the inverse products with the steps."""
+    """Where in a state of `size` numbers changes of slopes lie, and inverse products with their steps."""
     width = (size - MEMORY - 4) // (1 + 2 * MEMORY)
     return slice((1 + MEMORY) * width, (1 + 2 * MEMORY) * width), slice(size - MEMORY - 4, size - 4)

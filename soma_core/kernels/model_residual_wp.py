@@ -132,6 +132,7 @@ def _enter(real, load, step):
 
 
 def gathering(real, load, step):
+    """Function that brings a tile of vertices into lanes."""
     slots, points = tile_slots(), step.points
     at_point, at_target, at_weight = slots.point, slots.target, slots.weight
 
@@ -152,6 +153,7 @@ def gathering(real, load, step):
 
 
 def skinning(real, step):
+    """Function that skins a tile of vertices."""
     residual = step.residual
 
     @wp.func

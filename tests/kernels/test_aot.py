@@ -26,7 +26,7 @@ FOLDER = Path(soma_core.kernels.__file__).parent
 ROOT = FOLDER.parents[1]
 FILES = sorted(FOLDER.glob("*_wp.py"))
 
-CPU_ONLY: dict[str, str] = {}
+CPU_ONLY = {"descent_wp.descent": "a GPU takes the steps of a descent one by one, with blocks for patches"}
 """Kernels without a version for CUDA, as ``file_wp.kernel``, and why it takes another one there."""
 
 
