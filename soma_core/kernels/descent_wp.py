@@ -27,8 +27,8 @@ __all__ = ["Descended", "DescentRule", "descend", "remembered"]
 _ids, _short = wp.array(dtype=wp.int32), wp.array(dtype=wp.int16)
 
 _GROWTH = 40.0
-"""Relative damping of the first steps over the mean square error that is left [1/m^2]: the matrix does not know
-what curves by that error."""
+"""Relative damping of the first steps over the mean square error that is left [1/m^2]: the matrix does not
+know what curves by that error."""
 
 _SHORTEN = 0.3
 """Factor of a step that would have raised the error."""
