@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
@@ -19,6 +19,9 @@ from soma_core.inversion.gauss_newton import LONGEST_STEP
 from soma_core.inversion.priors import JointTerms, TwistDoubt
 from soma_core.inversion.problem import Pose, Problem, View
 from soma_core.inversion.protocol import ForwardModel
+
+if TYPE_CHECKING:
+    from soma_core.kernels.descent_wp import DescentRule
 
 __all__ = ["Refinement", "clumping"]
 
@@ -141,18 +144,15 @@ class Refinement:
             at_once: steps that all frames take together, as most of them need.
         """
         if knows_descent(self.model, self.problem):
-            from soma_core.kernels.descent_wp import DescentRule
-
-            rule = DescentRule(
-                tolerance=tolerance, share=share, unit=_unit(self.model), noise=_NOISE[self.mass.dtype],
-                floor=_FLOOR[self.mass.dtype] ** 2, damping=_START_DAMPING, lower=_LOWER, raised=_RAISE,
-                least_raised=_LEAST_RAISED, most=_MOST_DAMPING, longest=LONGEST_STEP,
-            )  # fmt: skip
             pose, self.state = descended(
-                self.model, self.problem, start, rule, self.bound, self.typical, self.state, renewed=_renewed,
-                iterations=iterations, at_once=at_once,
+                self.model, self.problem, start, self._rule(tolerance, share), self.bound, self.typical,
+                self.state, renewed=_renewed, iterations=iterations, at_once=at_once,
             )  # fmt: skip
             return pose
+        return self._step_by_step(start, iterations, tolerance, share)
+
+    def _step_by_step(self, start: Pose, iterations: int, tolerance: float, share: float) -> Pose:
+        """The same where a step is a few calls of kernels, or of torch."""
         solver, here, pose, out = self.model.solver, self, start, start
         view = self._first_view(start)
         rows = torch.arange(len(self.mass), device=self.mass.device)
@@ -201,6 +201,16 @@ class Refinement:
             if len(refused) and not _renewed(count + 1):
                 solve = here._again(solve, refused, pose, view, damping)
         return out.put(rows, pose)
+
+    def _rule(self, tolerance: float, share: float) -> DescentRule:
+        from soma_core.kernels.descent_wp import DescentRule
+
+        noise, floor = (table[self.mass.dtype] for table in (_NOISE, _FLOOR))
+        return DescentRule(
+            tolerance=tolerance, share=share, unit=_unit(self.model), noise=noise, floor=floor**2,
+            damping=_START_DAMPING, lower=_LOWER, raised=_RAISE, least_raised=_LEAST_RAISED,
+            most=_MOST_DAMPING, longest=LONGEST_STEP,
+        )  # fmt: skip
 
     def remember(self, before: Refinement) -> None:
         """Begin with the earlier steps of a descent on another model of the same poses."""

@@ -1,6 +1,7 @@
 """Native functions of the pose solver's kernels."""
 
 import functools
+from collections.abc import Mapping
 from types import SimpleNamespace
 
 import warp as wp
@@ -13,7 +14,7 @@ from soma_core.kernels import _view_text as view
 from soma_core.kernels._native import native
 from soma_core.kernels._solver_layout import COUNTS, KEPT, LISTS, NUMBERS, SLOTS
 
-__all__ = ["Task", "solver_functions"]
+__all__ = ["Task", "descent_functions", "solver_functions"]
 
 _ids = wp.array(dtype=wp.int32)
 
@@ -22,7 +23,6 @@ _BARE = {
     "assemble": matrix.ASSEMBLE, "twists": matrix.TWISTS, "modes": matrix.MODES, "factor": matrix.FACTOR,
     "forces": text.FORCES, "solve": text.SOLVE, "selected": variance.SELECTED, "keep": view.KEEP,
     "transform": view.TRANSFORM, "activate": view.ACTIVATE, "pull": view.PULL, "turn": view.TURN,
-    "taken": descent.TAKEN, "drawn": descent.DRAWN,
 }  # fmt: skip
 """Bodies that take nothing but the lists and the memory."""
 
@@ -31,11 +31,6 @@ _BARE = {
 def solver_functions(scalar: str, lanes: int, *, shared: bool) -> SimpleNamespace:
     real = wp.array(dtype=getattr(wp, scalar))
     number = getattr(wp, scalar)
-    begin = text.prelude(COUNTS, LISTS, NUMBERS, SLOTS, KEPT, shared=shared)
-
-    def made(body: str, stub):
-        stub.__name__ += "_one" if shared else "_each"
-        return native(begin + body, scalar, lanes, stub)
 
     def walk(plan: _ids, numbers: real, k: real, s: real, f: real, trial: int): ...
 
@@ -63,6 +58,43 @@ def solver_functions(scalar: str, lanes: int, *, shared: bool) -> SimpleNamespac
         plan: _ids, numbers: real, k: real, s: real, f: real, columns: _ids, spins: real, squares: real,
         count: int,
     ): ...  # fmt: skip
+
+    def root_turn(plan: _ids, numbers: real, k: real, s: real, f: real, damping_start: number): ...
+
+    bodies = {
+        "walk": (text.WALK, walk), "change": (text.CHANGE, change), "copy": (text.BEGIN, copy),
+        "terms": (text.TERMS, terms), "move": (text.MOVE, move), "accept": (text.ACCEPT, accept),
+        "still": (text.STILL, root_turn), "doubt": (view.DOUBT, doubt),
+    }  # fmt: skip
+    return _made({**bodies, **_bare(_BARE, real)}, scalar, lanes, shared=shared)
+
+
+def _bare(texts: Mapping[str, str], real) -> dict:
+    """Bodies that take nothing but the lists and the memory."""
+    bodies = {}
+    for name, body in texts.items():
+
+        def stub(plan: _ids, numbers: real, k: real, s: real, f: real): ...
+
+        stub.__name__ = name
+        bodies[name] = body, stub
+    return bodies
+
+
+def _made(bodies: Mapping[str, tuple], scalar: str, lanes: int, *, shared: bool) -> SimpleNamespace:
+    begin = text.prelude(COUNTS, LISTS, NUMBERS, SLOTS, KEPT, shared=shared)
+    for _, stub in bodies.values():
+        stub.__name__ += "_one" if shared else "_each"
+    return SimpleNamespace(
+        **{name: native(begin + body, scalar, lanes, stub) for name, (body, stub) in bodies.items()}
+    )
+
+
+@functools.cache
+def descent_functions(scalar: str, lanes: int, *, shared: bool) -> SimpleNamespace:
+    """Functions between those of the solver and of the model's residual, for a whole descent."""
+    real = wp.array(dtype=getattr(wp, scalar))
+    number = getattr(wp, scalar)
 
     def given(plan: _ids, numbers: real, k: real, s: real, f: real, turned: real, source: real): ...
 
@@ -95,24 +127,15 @@ def solver_functions(scalar: str, lanes: int, *, shared: bool) -> SimpleNamespac
         lower: number, raise_: number, least: number, most: number, shorten: number,
     ): ...  # fmt: skip
 
-    def root_turn(plan: _ids, numbers: real, k: real, s: real, f: real, damping_start: number): ...
-
     bodies = {
-        "walk": (text.WALK, walk), "change": (text.CHANGE, change), "copy": (text.BEGIN, copy),
-        "terms": (text.TERMS, terms), "move": (text.MOVE, move), "accept": (text.ACCEPT, accept),
-        "still": (text.STILL, root_turn), "doubt": (view.DOUBT, doubt), "given": (descent.GIVEN, given),
-        "brought": (descent.BROUGHT, brought), "weighed": (descent.WEIGHED, weighed),
-        "combined": (descent.COMBINED, combined), "doubted": (descent.DOUBTED, doubted),
-        "begun": (descent.BEGUN, begun), "mixed": (descent.MIXED, mixed), "judged": (descent.JUDGED, judged),
+        "given": (descent.GIVEN, given), "brought": (descent.BROUGHT, brought),
+        "weighed": (descent.WEIGHED, weighed), "combined": (descent.COMBINED, combined),
+        "doubted": (descent.DOUBTED, doubted), "begun": (descent.BEGUN, begun),
+        "mixed": (descent.MIXED, mixed), "judged": (descent.JUDGED, judged),
         "accepted": (descent.ACCEPTED, accepted),
     }  # fmt: skip
-    for name, body in _BARE.items():
-
-        def stub(plan: _ids, numbers: real, k: real, s: real, f: real): ...
-
-        stub.__name__ = name
-        bodies[name] = body, stub
-    return SimpleNamespace(**{name: made(*given) for name, given in bodies.items()})
+    bare = {"taken": descent.TAKEN, "drawn": descent.DRAWN}
+    return _made({**bodies, **_bare(bare, real)}, scalar, lanes, shared=shared)
 
 
 @wp.struct
