@@ -305,8 +305,7 @@ def descend(
     count, vertices = targets.shape[:2]
     lanes, scalar = lane_count(targets), scalar_name(targets.dtype)
     assert lanes > 1, "this kernel is for CPUs"
-    new = targets.new_empty
-    none = targets.new_zeros(1)
+    new, none = targets.new_empty, targets.new_zeros(1)
     columns, spins, base = (torch.zeros(1, dtype=torch.int32), none, none) if doubt is None else doubt
     rules = targets.new_tensor([
         rule.tolerance, rule.share, rule.unit, torch.finfo(targets.dtype).tiny, rule.noise, rule.floor,

@@ -259,3 +259,21 @@ def test_no_frames_are_no_mistake(layer, identity, inversion):
     found = inversion(posed(layer, identity, some_poses(1))[:0], identity)
     assert found.rotations.shape == (0, 77, 3, 3)
     assert found.converged.shape == (0,)
+
+
+def test_a_descent_in_one_kernel_ends_where_single_steps_do(layer, identity, inversion, fitted, monkeypatch):
+    vertices = posed(layer, identity, some_poses(20))
+    here = inversion(vertices, identity)
+    monkeypatch.setattr("soma_core.inversion.refine.knows_descent", lambda *_: False)
+    there = inversion(vertices, identity)
+    assert not torch.equal(here.rotations, there.rotations)  # else both took the same way
+    for one in (here, there):
+        assert one.converged.all()
+        assert one.vertex_error[:, fitted].max() < SAME_M
+
+
+def test_targets_may_lie_in_memory_in_any_order(layer, identity, inversion):
+    vertices = posed(layer, identity, some_poses(3))
+    strided = vertices.permute(2, 1, 0).contiguous().permute(2, 1, 0)
+    assert not strided.is_contiguous()
+    assert torch.equal(inversion(strided, identity).rotations, inversion(vertices, identity).rotations)
