@@ -56,8 +56,9 @@ def descended(
     pose = out = replace(start, last_change=torch.full_like(mass, torch.inf))
     rows, begin, end = torch.arange(len(mass)), 0, min(at_once, iterations)
     whole = mass.new_empty(len(mass), model.steps.under_way)
-    doubt = problem.doubt
-    known = doubt and (model.solver.columns(doubt.variable), doubt.axis.contiguous(), doubt.square)
+    doubt, known = problem.doubt, None
+    if doubt is not None:
+        known = model.solver.columns(doubt.variable), doubt.axis.contiguous(), doubt.square
     while True:
         made = tuple(step for step in range(begin, end + 1) if renewed(step))
         frames = len(rows)

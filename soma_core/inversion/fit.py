@@ -186,9 +186,7 @@ class PoseInversion(Derived):
         refuse_transforms()
         canonical = self.canonical(vertices, topology)
         with torch.no_grad():
-            # Each pass reads rows of frames: of a transposed tensor it would make them anew.
-            rows = canonical.detach().contiguous()
-            frames = self._frames(rows, identity, weights, bone_scale, initial)
+            frames = self._frames(canonical.detach().contiguous(), identity, weights, bone_scale, initial)
             result = self._fit_all(frames)
             strength = self.priors.temporal_strength
             for _ in range(self.priors.temporal_rounds if strength else 0):

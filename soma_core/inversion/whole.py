@@ -184,7 +184,7 @@ class WholeFit:
         if not len(rows) or not self.options.refreshes:
             return pose
         rows = problem.several(rows)
-        part = self._descended(self.model, problem.part(rows), pose.part(rows), None)
+        part, _ = self._descended(self.model, problem.part(rows), pose.part(rows), None)
         return pose.put(rows, part)
 
     def _approached(self, problem: Problem, pose: Pose, robust: float | None) -> tuple[Pose, _Clip | None]:
