@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 from soma_core._version import __version__
 from soma_core.errors import InputError, SomaError
-from soma_core.tasks import EXIT_BACKEND, EXIT_FAILED, EXIT_OK, EXIT_USAGE
+from soma_core.tasks import EXIT_BACKEND, EXIT_FAILED, EXIT_OK, EXIT_USAGE, exit_code
 
 if TYPE_CHECKING:
     from soma_core.config.compose import Task
@@ -88,7 +88,7 @@ def _usage() -> str:
     return "\n".join(
         [
             "usage: soma <task> [key=value ...]",
-            "       soma backends [list | show NAME | check NAME | new NAME] [--json]",
+            "       soma backends [list | known | show NAME | check NAME | new NAME] [--json]",
             "       soma points [list | show NAME [--picture FILE.png] | check NAME]",
             "       soma assets [verify | show | use | path | landmarks]",
             "       soma --version",
@@ -111,7 +111,7 @@ def _run_task(name: str, overrides: Sequence[str]) -> int:
     def report(outcome: Path | SomaError) -> None:
         if isinstance(outcome, SomaError):
             _complain(str(outcome))
-            codes.append(_exit_code(outcome))
+            codes.append(exit_code(outcome))
         else:
             _say(_shown(outcome))
 
@@ -199,14 +199,6 @@ def _dispatch(arguments: Sequence[str]) -> int:
     raise InputError("command", got=verb, expected=f"one of {', '.join(known)}", fix=fix)
 
 
-def _exit_code(error: SomaError) -> int:
-    from soma_core.plugin.errors import BackendError
-
-    if isinstance(error, BackendError):
-        return EXIT_BACKEND
-    return EXIT_USAGE if isinstance(error, InputError) else EXIT_FAILED
-
-
 def main(arguments: Sequence[str]) -> int:
     """Run one command and return its exit code: 0 ok, 1 a check failed, 2 usage, 3 backend not usable.
 
@@ -219,7 +211,7 @@ def main(arguments: Sequence[str]) -> int:
         if os.environ.get("SOMA_STRICT") == "1":
             raise
         _complain(str(error))
-        return _exit_code(error)
+        return exit_code(error)
     except BrokenPipeError:
         raise
     except OSError as error:  # a full disk, a folder that may not be written: no defect

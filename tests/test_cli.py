@@ -8,6 +8,7 @@ import os
 import subprocess
 import sys
 import warnings
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -97,12 +98,31 @@ def test_the_worst_job_of_a_sweep_sets_the_exit_code(tmp_path: Path, monkeypatch
     assert main(["animate", "--multirun", "seed=0,1,2"]) == EXIT_FAILED
 
 
+def test_a_preset_of_the_users_own_folder_names_the_backend_that_it_is_for(
+    tmp_path: Path, monkeypatch, capsys
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    own = tmp_path / "own" / "backend"
+    own.mkdir(parents=True)
+    (own / "heavy_man.yaml").write_text("defaults: [toy]\nparams: {girth: 1.3}\n")
+    (own / "nameless.yaml").write_text("params: {girth: 1.3}\n")
+    seen = []
+    monkeypatch.setattr(cli.TaskRow, "load", lambda row: lambda config, folder: seen.append(config.backend))
+    chosen = ["animate", "--config-dir", str(own.parent)]
+    assert main([*chosen, "backend=heavy_man", "backend.params.legs=0.9"]) == EXIT_OK
+    (backend,) = seen
+    assert (backend.name, backend.params.girth, backend.params.legs) == ("toy", 1.3, 0.9)
+    assert main([*chosen, "backend=nameless"]) == EXIT_BACKEND
+    assert main([*chosen, "backend=heavy_mann"]) == EXIT_USAGE
+    assert 'Did you mean "heavy_man"?' in capsys.readouterr().err
+
+
 def test_a_backend_that_is_not_usable_has_its_own_exit_code(tmp_path: Path, monkeypatch, capsys) -> None:
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setitem(KNOWN_BACKENDS, "absent", "soma-backend-absent")
+    monkeypatch.setitem(KNOWN_BACKENDS, "absent", replace(KNOWN_BACKENDS["toy"], name="absent"))
     assert main(["backends", "show", "absent"]) == EXIT_BACKEND
     assert main(["animate", "backend=absent"]) == EXIT_BACKEND
-    assert capsys.readouterr().err.count("Run: pip install soma-backend-absent") == 2
+    assert capsys.readouterr().err.count("pip install ./plugins/toy") == 2
 
 
 def test_strict_lets_the_traceback_through(monkeypatch) -> None:

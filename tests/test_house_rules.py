@@ -116,12 +116,14 @@ PUBLIC_NAMES = {
         write_body write_bvh write_products
     """,
     "soma_core.plugin": """
-        API_VERSION Axis BackendSpec BrokenBackendError Check CheckFailedError ClosestFaces FileNeeded
-        Generator HasLinearBasis HasPoseVector HasPosed HasRandomPoses HasSkinning HasTriangles Level
-        LinearBasis Parameter PluginError Registry SkinnedModel Unit WrapPair atomic_arrays atomic_write
+        API_VERSION Axis BackendSpec BrokenBackendError Check CheckFailedError CheckNotRunError ClosestFaces
+        Expressions FileNeeded Generator HasExpressions HasLinearBasis HasPoseVector HasPosed HasRandomPoses
+        HasSkinning HasTriangles Level
+        LinearBasis ModelMotion MotionFormat Parameter PluginError Registry SkinnedModel Unit WrapPair
+        atomic_arrays atomic_write
         axis_angle_to_matrix
         cached_arrays check closest_point_on_triangle content_key data_dir file_sha256 hookimpl model_folders
-        open_npz_file read_obj read_pickled_arrays refuse_unreadable write_obj
+        open_npz_file pose_skinned read_obj read_pickled_arrays refuse_unreadable write_obj
     """,
     "soma_core.testing": """
         Context Report check_backend conformance_suite
@@ -132,6 +134,7 @@ HOOKS = {
     "soma_checks": [],
     "soma_convert": ["source", "output"],
     "soma_generator": ["spec", "device", "dtype", "options"],
+    "soma_motions": [],
 }
 
 

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import ast
+import inspect
+import json
 import os
 import re
 import shlex
@@ -16,17 +18,21 @@ from typing import get_args
 import numpy as np
 import pytest
 
-from soma_core import load_canonical
+import soma_core.plugin
+from soma_core import load_canonical, read_motion
 from soma_core.plugin.errors import Stage
 from soma_core.testing.checks import CORE_CHECKS
 from soma_core.testing.synthetic import NATIVE_FROM_CANONICAL
+
+FEW_JOINTS_MM = 30.0
+"""Twelve joints cannot follow seventy-seven: hands, feet, neck and spine stay as they are at rest."""
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGE = (ROOT / "docs/writing_a_backend.md").read_text(encoding="utf-8")
 
 _STEP = re.compile(r"<!-- (?P<kind>session|runnable: session|file|append)(?:: (?P<path>\S+))? -->\n"
                    r"```\w+\n(?P<text>.*?)```", re.DOTALL)  # fmt: skip
-_SMALL = {"animate": ["lod=low", "write=[npz]"]}
+_SMALL = {"animate": ["lod=low", "write=[npz]"], "convert": ["lod=low"]}
 """Added to commands of the page, so that the test does not draw pictures."""
 
 
@@ -36,12 +42,37 @@ def a_model(path: Path) -> None:
     x, y, z = mesh.vertices.T
     waves = [np.sin(count * y + phase) for count in (2, 4, 6) for phase in (0.0, 1.0, 2.0)]
     fields = [mesh.vertices, *(np.stack([wave * x, 0 * y, wave * z], 1) for wave in waves)]
+    names, parents, weights = _skeleton()
+    both = weights * np.where(parents[None] < 0, 1, weights[:, parents]) + 1e-9  # the crease at a joint
     np.savez(
         path,
+        joint_names=names,
+        parents=parents,
+        weights=weights,
+        regressor=(both / both.sum(0)).T,
         template=mesh.vertices @ NATIVE_FROM_CANONICAL.T,
         directions=0.02 * np.stack(fields) @ NATIVE_FROM_CANONICAL.T,
         faces=mesh.triangles,
     )
+
+
+def _skeleton() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Names, parents and weights (n, J) of a skeleton: the canonical one without hands, feet and face."""
+    rig = load_canonical("low")[1]
+    full = rig.weights.toarray()
+    kept = [index for index, name in enumerate(rig.joint_names) if index and name in _JOINTS]
+    owner = np.zeros(len(rig.joint_names), int)
+    for index, parent in enumerate(rig.parents):
+        owner[index] = kept.index(index) if index in kept else owner[max(parent, 0)]
+    weights = np.stack([full[:, owner == number].sum(1) for number in range(len(kept))], 1)
+    parents = [-1 if not number else owner[rig.parents[index]] for number, index in enumerate(kept)]
+    return np.array([rig.joint_names[index] for index in kept]), np.array(parents), weights
+
+
+_JOINTS = (
+    *("Hips", "Spine1", "Chest", "Head"),
+    *(side + part for side in ("Left", "Right") for part in ("Arm", "ForeArm", "Leg", "Shin")),
+)
 
 
 def _install(folder: Path) -> Path:
@@ -115,12 +146,40 @@ def test_the_page_leads_from_nothing_to_a_backend_that_passes(walked):
     assert len(checks) == 2  # as generated, and as changed
     for text in checks:
         assert "FAILED" not in text
-        assert re.search(rf"\b{len(CORE_CHECKS) - 3} passed, 3 not applicable", text)
-    assert "acme/first-is-stature" in printed[-1][1]
+        assert re.search(rf"\b{len(CORE_CHECKS) - 10} passed, 10 not applicable", text)
+    assert any("acme/first-is-stature" in text for command, text in printed if command.endswith('"acme/*"'))
     shown = next(text for command, text in printed if command == "soma backends show acme")
     assert "4505 native, 18056 canonical" in shown
     animated = [text for command, text in printed if command.startswith("soma animate")]
     assert all((folder / text.splitlines()[-1] / "motion.npz").is_file() for text in animated)
+
+
+def test_a_model_of_others_is_a_source_and_a_target_of_convert(walked):
+    folder, _ = walked
+    with np.load(folder / "as_acme/motion.npz") as file:
+        assert file["acme_turns"].shape == (5, len(_skeleton()[0]), 3)
+        assert np.abs(file["acme_turns"]).max() > 0.1
+    report = json.loads((folder / "as_acme/report.json").read_text())
+    assert report["settings"]["format"] == "acme_npz"
+    assert report["error_mm"]["all"]["mean"] < FEW_JOINTS_MM
+    back = json.loads((folder / "back/report.json").read_text())
+    assert back["settings"]["layout"] == "acme_npz"
+    assert back["error_mm"]["all"]["mean"] < FEW_JOINTS_MM
+    assert len(read_motion(folder / "back/motion.npz").rotations) == 5
+
+
+@pytest.mark.parametrize("line", re.findall(r"^\| `(\w+)\((.*)\) -> (.*?)` \| `(\w+)`", PAGE, re.MULTILINE))
+def test_the_page_has_the_signatures_of_the_capabilities(line):
+    method, arguments, returned, protocol = line
+    signature = inspect.signature(getattr(getattr(soma_core.plugin, protocol), method))
+    found = ", ".join(map(str, signature.parameters.values())).replace("'", "")
+    assert (found, signature.return_annotation) == (arguments, returned)
+
+
+def test_the_page_names_every_capability():
+    protocols = {name for name in soma_core.plugin.__all__ if name.startswith("Has")}
+    part = PAGE.split("<!-- capabilities:begin -->")[1].split("<!-- capabilities:end -->")[0]
+    assert set(re.findall(r"`(Has\w+)`", part)) == protocols
 
 
 def test_the_page_shows_every_file_that_is_written(walked):
@@ -129,7 +188,7 @@ def test_the_page_shows_every_file_that_is_written(walked):
     folder = walked[0] / block["head"]
     written = {str(path.relative_to(folder)) for path in folder.rglob("*") if path.is_file()}
     ours = {path for path in written if "__pycache__" not in path and ".dist-info" not in path}
-    assert ours == shown | {"soma_backend_acme/_checks.py"}  # section 7 adds it
+    assert ours == shown | {"soma_backend_acme/_checks.py", "soma_backend_acme/_posed.py"}  # added later
 
 
 def test_the_generator_of_the_page_is_the_generated_one():
@@ -148,7 +207,8 @@ def test_the_table_of_checks_is_the_list_of_checks():
     assert [(row[0].strip("`"), row[1]) for row in _rows("checks")] == [
         (check.id, check.summary) for check in CORE_CHECKS
     ]
-    assert all(len(row) == 3 and row[2] for row in _rows("checks"))
+    for row, check in zip(_rows("checks"), CORE_CHECKS, strict=True):
+        assert row[2] == check.mend or check.id == "declares"  # which links to the errors
 
 
 def test_the_errors_are_ordered_by_stage():
@@ -211,7 +271,7 @@ def _messages(*modules: str) -> Iterator[str]:
 
 
 BACKEND = (
-    *(f"plugin/{name}.py" for name in ("declaration", "hooks", "registry", "configs", "options")),
+    *(f"plugin/{name}.py" for name in ("declaration", "hooks", "registry", "record", "configs", "options")),
     "files.py",
     "obj.py",
     *(f"topology/{name}.py" for name in ("wrap_pair", "correspondence", "transfer")),

@@ -1,9 +1,9 @@
-"""Write native.obj and wrap.obj of the toy: ``python make_wrap.py`` (some seconds).
+"""Write native.obj and SOMA_wrap.obj of the toy: ``python make_wrap.py`` (some seconds).
 
 ``native.obj`` is the default figure: all its vertices, and the faces that do not lie inside the body.
-``wrap.obj`` is the canonical mesh laid on it: each vertex goes to the closest point of the outside, and the
-displacements are evened out between neighbours, so that the surface does not fold where capsules meet. A
-body less simple needs a registration tool instead.
+``SOMA_wrap.obj`` is the canonical mesh laid on it: each vertex goes to the closest point of the outside, and
+the displacements are evened out between neighbours, so that the surface does not fold where capsules meet.
+``soma wrap`` is for bodies less simple.
 """
 
 from __future__ import annotations
@@ -65,7 +65,7 @@ def main() -> None:
     wrap = wrapped(ideal, neighbour_mean(mesh.triangles))
     wrap[mesh.face_interior] = ideal[mesh.face_interior]  # declared in fill_segments, so never looked at
     write_obj(FOLDER / "native.obj", *outside(), digits=3)  # a hundredth of a millimetre
-    write_obj(FOLDER / "wrap.obj", wrap, mesh.triangles, digits=3)
+    write_obj(FOLDER / "SOMA_wrap.obj", wrap, mesh.triangles, digits=3)
 
 
 if __name__ == "__main__":

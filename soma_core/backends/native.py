@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -61,6 +61,7 @@ def soma_backend() -> BackendSpec:
     count = component_count(assets_dir() / _FILE)
     return BackendSpec(
         name="soma",
+        api=2,
         unit="cm",
         up="+y",
         forward="+z",
@@ -80,12 +81,12 @@ def soma_backend() -> BackendSpec:
 
 @hookimpl
 def soma_generator(
-    spec: BackendSpec, device: torch.device, dtype: torch.dtype, options: Mapping[str, Any]
+    spec: BackendSpec, device: torch.device, dtype: torch.dtype, options: NativeOptions
 ) -> Generator:
     """Build the generator from the shipped shape space, or from the one that the options name."""
     from soma_core.rig.neutral import load_shape_space
 
-    path = options.get("shape_space")
+    path = options.shape_space
     space = load_shape_space(expanded(path) if path else None)
     scaled = np.sqrt(space.eigenvalues.astype(np.float64))[:, None] * space.shapedirs
     (count,) = spec.params[0].shape

@@ -17,6 +17,7 @@ from omegaconf.errors import (
 from yaml import YAMLError
 
 from soma_core.errors import InputError, SomaError
+from soma_core.paths import configs_dir
 from soma_core.plugin.declaration import did_you_mean
 from soma_core.plugin.errors import BrokenBackendError
 from soma_core.plugin.registry import default_registry
@@ -86,19 +87,34 @@ def _unparsed(error: OverrideParseException) -> InputError:
 def check_backend_choice(config: DictConfig) -> None:
     """Refuse a composed configuration whose backend is not the one that was chosen by ``backend=NAME``.
 
+    A file of the user's ``--config-dir`` may be called as he likes, and names the backend that it is for.
+
     Raises:
         BackendError: the plugin's config names no backend, or another.
         InputError: the command line does.
     """
     choice = HydraConfig.get().runtime.choices.get("backend")
-    if choice is None or (not OmegaConf.is_missing(config.backend, "name") and config.backend.name == choice):
+    if choice is None:
+        return
+    named = "" if OmegaConf.is_missing(config.backend, "name") else str(config.backend.name)
+    if choice == named or (named and _is_own_preset(str(choice))):
         return
     if any(each.startswith("backend.name=") for each in HydraConfig.get().overrides.task):
         raise InputError(
             "backend.name", got=config.backend.name, expected=choice, fix="Choose a backend with backend=NAME"
         )
-    got = "no name" if OmegaConf.is_missing(config.backend, "name") else f"name: {config.backend.name}"
+    got = f"name: {named}" if named else "no name"
     raise _broken_file(f"backend/{choice}.yaml", f"got {got}, expected name: {choice}")
+
+
+def _is_own_preset(choice: str) -> bool:
+    """Whether ``backend=CHOICE`` is a file of the user's own folder, which may name any backend: a preset."""
+    shipped = {str(folder) for folder in (configs_dir(), *default_registry().config_offers())}
+    for source in HydraConfig.get().runtime.config_sources:
+        folder = str(source.path).removeprefix("file://")
+        if source.schema == "file" and (Path(folder) / "backend" / f"{choice}.yaml").is_file():
+            return folder not in shipped
+    return False
 
 
 def _missing_choice(error: MissingConfigException) -> SomaError:
@@ -107,9 +123,10 @@ def _missing_choice(error: MissingConfigException) -> SomaError:
     clash = registry.config_clashes().get(f"{error.missing_cfg_file}.yaml")
     if clash is not None:
         return clash
-    if group == "backend":
-        return registry.missing_config(choice)
     options = list(error.options or ())
+    presets = [each for each in options if each not in registry.names()]
+    if group == "backend" and not did_you_mean(choice, presets):
+        return registry.missing_config(choice)
     return InputError(
         group or "configuration",
         got=choice or str(error),

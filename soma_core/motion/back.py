@@ -21,12 +21,19 @@ from soma_core.motion.converter import Converted, earlier_report
 from soma_core.motion.files import ResultFiles, fingerprint, layout_of, no_motion, read
 from soma_core.motion.models import model_settings
 from soma_core.motion.native_errors import NativeErrors
-from soma_core.motion.native_results import NativeTarget, ParameterTarget, SmplTarget, VertexTarget
+from soma_core.motion.native_results import (
+    ModelTarget,
+    NativeTarget,
+    ParameterTarget,
+    SmplTarget,
+    VertexTarget,
+)
 from soma_core.motion.options import ConvertOptions
 from soma_core.motion.played import MovingBodies, Played, placing_of
 from soma_core.motion.questions import heard, of_motion, of_params, say
 from soma_core.native import NativeFit, NativeTransfer, ParameterFit
 from soma_core.plugin.registry import default_registry
+from soma_core.plugin.spec import HasSkinning, MotionFormat
 from soma_core.progress import progress
 
 __all__ = ["BackConverter"]
@@ -105,7 +112,8 @@ class BackConverter:
             return VertexTarget(transfer=self._targets[name], products=products)
         own = stored if stored["backend"] == name and "rest" not in stored else {}
         if name not in SMPL_JOINTS:
-            return self._parameter_target(own, kind)
+            form = written_format(name)
+            return self._parameter_target(own, kind) if form is None else self._model_target(own, kind, form)
         kept = str(own.get("options", {}).get("gender", "neutral"))
         gender = str(chosen.gender or kept)
         own = own if gender == kept else {}  # its coefficients are another body in another gender's model
@@ -125,8 +133,26 @@ class BackConverter:
             layout=str(chosen.layout or SmplLayout.amass),
         )  # fmt: skip
 
-    def _parameter_target(self, own: Mapping[str, Any], kind: Mapping[str, Any]) -> NativeTarget:
-        """What becomes of the body in a model whose pose is one vector."""
+    def _model_target(
+        self, own: Mapping[str, Any], kind: Mapping[str, Any], form: MotionFormat
+    ) -> NativeTarget:
+        """What becomes of the body in the model of a plugin that writes motion files."""
+        name, options = self._options.to, own.get("options") or {}
+        self._refuse_smpl_settings()
+        if name not in self._targets:
+            generator = default_registry().generator(
+                name, options=options, device=torch.device(kind["device"]), dtype=torch.float32
+            )
+            fit = NativeFit if isinstance(generator, HasSkinning) else ParameterFit
+            self._targets[name] = fit(name, options=options, **kind)
+        fit = self._targets[name]
+        return ModelTarget(
+            fit=fit, errors=NativeErrors(fit.transfer, kind["lod"]), model=name, form=form,
+            params=own.get("params"), options=options,
+        )  # fmt: skip
+
+    def _refuse_smpl_settings(self) -> None:
+        """Refuse what only models of the SMPL family have."""
         chosen, name = self._options, self._options.to
         for setting in ("up", "axes", "gender", "betas", "num_betas", "layout"):
             if getattr(chosen, setting) is not None:
@@ -134,6 +160,11 @@ class BackConverter:
                     setting, got=str(getattr(chosen, setting)), expected=f"none with to={name}",
                     fix=f"Leave {setting} out.",
                 )  # fmt: skip
+
+    def _parameter_target(self, own: Mapping[str, Any], kind: Mapping[str, Any]) -> NativeTarget:
+        """What becomes of the body in a model whose pose is one vector."""
+        name = self._options.to
+        self._refuse_smpl_settings()
         if name not in self._targets:
             self._targets[name] = ParameterFit(name, options=own.get("options"), **kind)
         fit = self._targets[name]
@@ -142,7 +173,9 @@ class BackConverter:
         )
 
 
-def _found_params(file: Path, target: SmplTarget | ParameterTarget, body: Played) -> dict[str, list[float]]:
+def _found_params(
+    file: Path, target: SmplTarget | ParameterTarget | ModelTarget, body: Played
+) -> dict[str, list[float]]:
     """Parameters of the model's body that comes nearest, or those that an earlier run found."""
     if not file.is_file():
         found = target.find(body)
@@ -158,7 +191,13 @@ def _convert_missing(body: Played, target: NativeTarget, kept: FittedChunks) -> 
 
 
 def _usual_result(options: ConvertOptions) -> str:
-    return "poses" if options.to in SMPL_JOINTS and not options.shown else "vertices"
+    has_files = options.to in SMPL_JOINTS or written_format(options.to) is not None
+    return "poses" if has_files and not options.shown else "vertices"
+
+
+def written_format(name: str) -> MotionFormat | None:
+    """The motion files of a backend that its plugin writes; None where there are none."""
+    return next((each for each in default_registry().formats(name) if each.write is not None), None)
 
 
 def _refuse_for_vertices(options: ConvertOptions) -> None:

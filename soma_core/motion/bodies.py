@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from soma_core.errors import AssetError, InputError
+from soma_core.errors import AssetError, InputError, SomaError
 from soma_core.io.amass import SmplMotion
 from soma_core.io.rotation_vectors import in_radians
 from soma_core.io.sam3d import Sam3dFrames, read_sam3d
@@ -28,13 +28,14 @@ from soma_core.motion.models import (
 from soma_core.motion.options import ConvertOptions, FitOptions, InvertOptions
 from soma_core.motion.posed_input import PosedInput
 from soma_core.motion.questions import of_params, of_rate, of_smpl
-from soma_core.plugin.errors import BackendError, BrokenBackendError
+from soma_core.plugin.declaration import motion_problem
+from soma_core.plugin.errors import BackendError, BrokenBackendError, PluginError
 from soma_core.plugin.registry import default_registry
 
 if TYPE_CHECKING:
     from soma_core.plugin.spec import BackendSpec
 
-__all__ = ["FITTED", "SMPL_LAYOUTS", "SMPL_SETTINGS", "ShownBody", "open_body"]
+__all__ = ["FITTED", "SMPL_LAYOUTS", "SMPL_SETTINGS", "ShownBody", "is_fitted", "open_body"]
 
 _log = logging.getLogger(__name__)
 
@@ -87,7 +88,51 @@ def open_body(path: Path, layout: str, options: FitOptions, backends: FitBackend
     Raises:
         SomaError: the file, or the backend that it needs, cannot be used.
     """
-    return FITTED[layout](path, options, backends or FitBackends(options))
+    backends = backends or FitBackends(options)
+    if layout in FITTED:
+        return FITTED[layout](path, options, backends)
+    return _model_body(path, layout, options, backends)
+
+
+def is_fitted(layout: str) -> bool:
+    """Whether files of a layout show bodies of a model, which are fitted: of the core's or of a plugin's."""
+    return layout in FITTED or layout in default_registry().motion_formats()
+
+
+def _model_body(path: Path, layout: str, options: FitOptions, backends: FitBackends) -> ShownBody:
+    """The body of a file that a plugin reads, posed by the plugin's own model.
+
+    Raises:
+        SomaError: the file cannot be read, or the backend's model is not there.
+        BackendError: the plugin fails, or what it gives is no motion.
+    """
+    name, form = default_registry().motion_formats()[layout]
+    assert form.read is not None
+    try:
+        motion = form.read(path)
+    except Exception as error:
+        if isinstance(error, SomaError):
+            raise
+        with default_registry().isolated(name, "hooks"):
+            raise
+    with default_registry().isolated(name, "hooks"):
+        problem = motion_problem(motion)
+        if problem is not None:
+            raise PluginError(f"motion format {layout}: {problem}")
+    backend = backends.get(name, motion.options)
+    spec, params = backend.layer.spec, {key: np.asarray(each).tolist() for key, each in motion.params.items()}
+    pose = {key: np.asarray(value) for key, value in motion.pose.items()}
+    up = options.upward or motion.up or spec.up
+    sequence = ModelSequence(path, backend, params, pose, fps=options.fps or motion.fps, up=up)
+    return ShownBody(
+        backend=backend,
+        posed=PosedInput(sequence, backend.layer, topology="native"),
+        params=params,
+        search={},
+        facts={"up": up},
+        licence=f"that of {path.name}; body model: {spec.licence}",
+        doubts=tuple(of_rate(sequence.fps or 0) + of_params(spec, params, setting="")),
+    )
 
 
 def _vertex_body(path: Path, options: InvertOptions, backends: FitBackends) -> ShownBody:

@@ -22,7 +22,7 @@ from soma_core.io.smpl_files import people_of
 from soma_core.motion.back import BackConverter
 from soma_core.motion.bodies import SMPL_LAYOUTS
 from soma_core.motion.converter import Converted, Converter
-from soma_core.motion.files import SUFFIXES, ResultFiles, layout_of, no_motion, read
+from soma_core.motion.files import ResultFiles, layout_of, motion_suffixes, no_motion, read
 from soma_core.motion.options import ConvertOptions
 from soma_core.motion.poses import POSES, named_pose
 from soma_core.motion.questions import Names, of_motion, say
@@ -243,7 +243,7 @@ def convert_folder(
     if not files:
         raise InputError(
             str(folder),
-            got=f"no file ending in {' or '.join(SUFFIXES)}",
+            got=f"no file ending in {' or '.join(motion_suffixes())}",
             expected="motion files, at any depth",
             fix="Name the folder that holds them.",
         )
@@ -285,9 +285,10 @@ def _converter(options: ConvertOptions, *, refuse_unused: bool = True) -> Conver
 
 def _files(folder: Path) -> Iterator[Path]:
     """Files that may hold a motion, hidden ones apart, in the order of their names."""
+    suffixes = motion_suffixes()
     for file in sorted(folder.resolve().rglob("*")):
         hidden = any(part.startswith(".") for part in file.relative_to(folder.resolve()).parts)
-        if file.suffix.lower() in SUFFIXES and not hidden and file.is_file():
+        if file.suffix.lower() in suffixes and not hidden and file.is_file():
             yield file
 
 

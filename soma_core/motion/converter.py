@@ -14,7 +14,7 @@ from soma_core.errors import AssetError, InputError, SomaError
 from soma_core.io.motion import Motion
 from soma_core.io.motion_files import read_motion
 from soma_core.json_file import read_json
-from soma_core.motion.bodies import FITTED, SMPL_LAYOUTS, open_body
+from soma_core.motion.bodies import SMPL_LAYOUTS, is_fitted, open_body
 from soma_core.motion.carried import carried
 from soma_core.motion.chunks import refuse_other_settings
 from soma_core.motion.files import Layout, ResultFiles, layout_of, no_motion, read, write
@@ -111,7 +111,7 @@ class Converter:
             return self._pointed(path, files, before)
         layout, options = _known_layout(path), self._options
         retargeted = layout == "skeleton" or (layout in SMPL_LAYOUTS and options.carry == "skeleton")
-        fitted = layout in FITTED and not retargeted
+        fitted = is_fitted(layout) and not retargeted
         with heard() as said:
             unused_settings(path, layout, options, refuse=self._refuse_unused)
             if retargeted:
@@ -292,7 +292,7 @@ def plan_fit(
     )  # another process may stand elsewhere
     options = options or ConvertOptions()
     layout = "vertices" if isinstance(options, InvertOptions) else _known_layout(source)
-    if layout not in FITTED:
+    if not is_fitted(layout):
         raise InputError(
             str(source), got=f"the layout {layout}", expected="a body to fit", fix="Convert or read it."
         )

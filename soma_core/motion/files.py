@@ -21,10 +21,21 @@ from soma_core.io.smpl_bodies import shown_names
 from soma_core.io.smpl_files import smpl_layout
 from soma_core.motion.writers import WRITERS
 from soma_core.paths import expanded
+from soma_core.plugin.registry import default_registry
 from soma_core.rig import load_canonical
 from soma_core.topology.frames import METRES
 
-__all__ = ["SUFFIXES", "Layout", "ResultFiles", "fingerprint", "layout_of", "no_motion", "read", "write"]
+__all__ = [
+    "SUFFIXES",
+    "Layout",
+    "ResultFiles",
+    "fingerprint",
+    "layout_of",
+    "motion_suffixes",
+    "no_motion",
+    "read",
+    "write",
+]
 
 Layout = Literal["soma", "kimodo", "amass", "smpl", "sam3d", "skeleton"]
 
@@ -78,13 +89,44 @@ class ResultFiles:
         return self.folder / file if self.name is None else self.folder / product / (self.name + file.suffix)
 
 
-def layout_of(path: str | Path) -> Layout | None:
+def motion_suffixes() -> tuple[str, ...]:
+    """Suffixes of files that may hold a motion, of those that plugins read too."""
+    formats = [each for _, each in default_registry().motion_formats().values() if each.read is not None]
+    return tuple(dict.fromkeys((*SUFFIXES, *(suffix for each in formats for suffix in each.suffixes))))
+
+
+def layout_of(path: str | Path) -> Layout | str | None:
     """Which motion a file holds, told by its keys; None where it holds none.
+
+    What the core does not know may be of a format that a plugin names.
 
     Raises:
         AssetError: the file is missing, damaged, a git-LFS pointer or not what its suffix says.
     """
     path = expanded(path)
+    known = path.suffix.lower() in SUFFIXES
+    return (_known_layout(path) if known else None) or _plugin_format(path) or _known_layout(path)
+
+
+def _plugin_format(path: Path) -> str | None:
+    """Name of the format of a plugin that a file has."""
+    suffix = path.suffix.lower()
+    for name, (_, each) in default_registry().motion_formats().items():
+        if each.read is not None and suffix in each.suffixes and {*each.keys} <= _keys(path, each.keys):
+            return name
+    return None
+
+
+def _keys(path: Path, wanted: tuple[str, ...]) -> set[str]:
+    """Names that a file holds, where any are wanted of it."""
+    if not wanted or path.suffix.lower() not in DATA_SUFFIXES:
+        return set()
+    with open_data(path) as file:
+        return {str(name) for name in file.content} if isinstance(file.content, dict) else set()
+
+
+def _known_layout(path: Path) -> Layout | None:
+    """The layout of those that the core knows."""
     suffix = path.suffix.lower()
     if suffix == ".parquet":
         return "sam3d"

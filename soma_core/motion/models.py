@@ -22,6 +22,7 @@ from soma_core.io.vertex_sequence import UpAxis, VertexSequence
 from soma_core.layer import SomaLayer
 from soma_core.motion.options import FitOptions
 from soma_core.options import InversionChoice, ModelOptions, Options
+from soma_core.plugin.declaration import refuse_posed
 from soma_core.plugin.registry import default_registry
 from soma_core.plugin.spec import HasPosed, HasSkinning
 from soma_core.rig import load_canonical
@@ -72,7 +73,9 @@ class FitBackend:
     def posed(self, params: Mapping[str, Tensor], pose: Mapping[str, Tensor]) -> Tensor:
         """The model's own posed vertices; what goes wrong inside names the backend."""
         with default_registry().isolated(self.layer.backend, "rest"), torch.no_grad():
-            return self._generator.posed(params, pose)
+            found = self._generator.posed(params, pose)
+            refuse_posed(found, len(next(iter(pose.values()))))
+            return found
 
     @property
     def mean_hands(self) -> np.ndarray | None:

@@ -25,9 +25,13 @@ from soma_core.motion.played import Played
 from soma_core.motion.posed_input import world_axes
 from soma_core.motion.writers import WRITERS
 from soma_core.native import NativeFit, NativeTransfer, ParameterFit
+from soma_core.native.motion import NativeMotion
+from soma_core.native.parameters import ParameterMotion
+from soma_core.plugin.registry import default_registry
+from soma_core.plugin.spec import ModelMotion, MotionFormat
 from soma_core.topology.frames import METRES
 
-__all__ = ["NativeTarget", "ParameterTarget", "SmplTarget", "VertexTarget"]
+__all__ = ["ModelTarget", "NativeTarget", "ParameterTarget", "SmplTarget", "VertexTarget"]
 
 _log = logging.getLogger(__name__)
 
@@ -141,10 +145,7 @@ class SmplTarget:
 
     def find(self, body: Played) -> Mapping[str, Tensor]:
         """Parameters of the model's body that comes nearest to frames spread over a motion."""
-        frames = body.motion.frame_count
-        spread = np.unique(np.linspace(0, frames - 1, min(_SEARCHED, frames)).round().astype(int))
-        _log.info("finding the body from %d frames", len(spread))
-        return self.fit.fit_params(body.posed(spread))
+        return _found_by_frames(self.fit, body)
 
     @property
     def facts(self) -> Mapping[str, Any]:
@@ -168,10 +169,7 @@ class SmplTarget:
             "rotations": found.rotations.float().cpu().numpy(),
             "translation": found.translation.float().cpu().numpy(),
             "determined": found.determined.cpu().numpy(),
-            "valid": found.valid.cpu().numpy(),
-            "converged": found.converged.cpu().numpy(),
-            "iterations": found.iterations.cpu().numpy(),
-            **self.errors.statistics(found.vertex_error.float().cpu().numpy()),
+            **_told(found, self.errors),
         }
 
     def write(self, chunks: FittedChunks, files: ResultFiles, *, fps: float, source: str) -> dict[str, Any]:
@@ -223,10 +221,7 @@ class ParameterTarget:
 
     def find(self, body: Played) -> Mapping[str, Tensor]:
         """Parameters of the model's body that comes nearest to the T-pose."""
-        _log.info("finding the body from its T-pose")
-        layer = body.layer
-        still = torch.zeros(1, len(layer.joint_names), 3, device=layer.device, dtype=layer.dtype)
-        return self.fit.fit_params(layer.pose(body.identity, still).vertices)
+        return _found_by_t_pose(self.fit, body)
 
     def arrays(self, vertices: Tensor) -> dict[str, np.ndarray]:
         """Parameters of the frames, and statistics of the error."""
@@ -234,10 +229,7 @@ class ParameterTarget:
         own = self.fit.generator.own_arrays(found.params, found.parameters)
         return {
             **{_OWN + name: value.float().cpu().numpy() for name, value in own.items()},
-            "valid": found.valid.cpu().numpy(),
-            "converged": found.converged.cpu().numpy(),
-            "iterations": found.iterations.cpu().numpy(),
-            **self.errors.statistics(found.vertex_error.float().cpu().numpy()),
+            **_told(found, self.errors),
         }
 
     def write(self, chunks: FittedChunks, files: ResultFiles, *, fps: float, source: str) -> dict[str, Any]:
@@ -247,6 +239,93 @@ class ParameterTarget:
         told = {"model": self.model, "fps": fps, "source": source}
         atomic_arrays(files.motion, own | {name: np.asarray(value) for name, value in told.items()})
         return _figures(chunks, files, self.errors)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class ModelTarget:
+    """Poses of a plugin's model, in files that the plugin writes.
+
+    Attributes:
+        fit: to the model, by its skinning or by its pose vector.
+        errors: by regions of its mesh.
+        model: name of its backend.
+        form: what its files are.
+        params: the body; None while it is yet to be found.
+        options: of the backend.
+    """
+
+    fit: NativeFit | ParameterFit
+    errors: NativeErrors
+    model: str
+    form: MotionFormat
+    params: Mapping[str, Any] | None
+    options: Mapping[str, Any]
+
+    @property
+    def facts(self) -> Mapping[str, Any]:
+        """The body, and the file."""
+        params = "found" if self.params is None else dict(self.params)
+        return {"to": self.model, "format": self.form.name, "params": params, "up": self.fit.spec.up}
+
+    def results(self, files: ResultFiles) -> dict[str, Path]:
+        """One file of poses."""
+        return {self.form.name: self._file(files)}
+
+    def _file(self, files: ResultFiles) -> Path:
+        return files.motion.with_suffix(self.form.suffixes[0])
+
+    def find(self, body: Played) -> Mapping[str, Tensor]:
+        """Parameters of the model's body that comes nearest."""
+        if isinstance(self.fit, NativeFit):
+            return _found_by_frames(self.fit, body)
+        return _found_by_t_pose(self.fit, body)
+
+    def arrays(self, vertices: Tensor) -> dict[str, np.ndarray]:
+        """Poses of the frames, and statistics of the error."""
+        found = self.fit(vertices, params=self.params)
+        names = ("rotations", "translation") if isinstance(self.fit, NativeFit) else ("parameters",)
+        poses = {_OWN + name: getattr(found, name).float().cpu().numpy() for name in names}
+        return {**poses, **_told(found, self.errors)}
+
+    def write(self, chunks: FittedChunks, files: ResultFiles, *, fps: float, source: str) -> dict[str, Any]:
+        """Let the plugin write its file; write ``files.frames``."""
+        names = [name for name in chunks.names(0) if name.startswith(_OWN)]
+        pose = {name[len(_OWN) :]: np.concatenate(list(_column(chunks, name))) for name in names}
+        motion = ModelMotion(
+            params=dict(self.params or {}), pose=pose, fps=fps, up=self.fit.spec.up, options=self.options,
+            source=source,
+        )  # fmt: skip
+        assert self.form.write is not None
+        with default_registry().isolated(self.model, "hooks"):
+            self._file(files).parent.mkdir(parents=True, exist_ok=True)
+            self.form.write(self._file(files), motion)
+        return _figures(chunks, files, self.errors)
+
+
+def _found_by_frames(fit: NativeFit, body: Played) -> Mapping[str, Tensor]:
+    """Parameters of the model's body that comes nearest to frames spread over a motion."""
+    frames = body.motion.frame_count
+    spread = np.unique(np.linspace(0, frames - 1, min(_SEARCHED, frames)).round().astype(int))
+    _log.info("finding the body from %d frames", len(spread))
+    return fit.fit_params(body.posed(spread))
+
+
+def _found_by_t_pose(fit: ParameterFit, body: Played) -> Mapping[str, Tensor]:
+    """Parameters of the model's body that comes nearest to the T-pose."""
+    _log.info("finding the body from its T-pose")
+    layer = body.layer
+    still = torch.zeros(1, len(layer.joint_names), 3, device=layer.device, dtype=layer.dtype)
+    return fit.fit_params(layer.pose(body.identity, still).vertices)
+
+
+def _told(found: NativeMotion | ParameterMotion, errors: NativeErrors) -> dict[str, np.ndarray]:
+    """What a fit says of each frame, and statistics of its error."""
+    return {
+        "valid": found.valid.cpu().numpy(),
+        "converged": found.converged.cpu().numpy(),
+        "iterations": found.iterations.cpu().numpy(),
+        **errors.statistics(found.vertex_error.float().cpu().numpy()),
+    }
 
 
 def _figures(chunks: FittedChunks, files: ResultFiles, errors: NativeErrors) -> dict[str, Any]:

@@ -21,6 +21,8 @@ from soma_core.native.motion import NativeMotion
 from soma_core.native.poses import PoseFit
 from soma_core.native.shape import fit_shape
 from soma_core.native.transfer import NativeTransfer
+from soma_core.plugin.declaration import skinned_problem
+from soma_core.plugin.errors import PluginError
 from soma_core.plugin.registry import Registry, default_registry
 from soma_core.plugin.spec import HasSkinning, SkinnedModel
 from soma_core.rig.mesh import Lod
@@ -106,6 +108,10 @@ class NativeFit(Derived):
         self.spec, self.scale = self.transfer.spec, METRES[self.transfer.spec.unit]
         covered = self.transfer.covered.cpu().numpy()
         model = self._model(self._one_body({}))
+        with self._isolated():
+            problem = skinned_problem(model, 1, self.transfer.count)
+            if problem is not None:
+                raise PluginError(problem, fix=f"Run: soma backends check {backend} -k skinning")
         self.rig = NativeRig(model, self.scale, covered, kernels=self.kernels, device=device, dtype=dtype)
         self.joint_names = self.rig.joint_names
 

@@ -17,6 +17,7 @@ from torch import Tensor
 from soma_core.backends.parameters import batch_parameters
 from soma_core.errors import InputError
 from soma_core.native.transfer import NativeTransfer
+from soma_core.plugin.declaration import refuse_posed
 from soma_core.plugin.registry import Registry, default_registry
 from soma_core.plugin.spec import HasPoseVector
 from soma_core.rig.mesh import Lod
@@ -288,7 +289,9 @@ class ParameterFit:
 
     def _posed(self, params: Mapping[str, Tensor], parameters: Tensor) -> Tensor:
         with self._isolated():
-            return self.scale * self.generator.posed(params, {"parameters": parameters})
+            found = self.generator.posed(params, {"parameters": parameters})
+            refuse_posed(found, len(parameters))
+            return self.scale * found
 
 
 _Inputs = Callable[[Tensor], tuple[Mapping[str, Tensor], Tensor]]

@@ -16,10 +16,11 @@ if TYPE_CHECKING:
     from soma_core.geometry.barycentric import closest_point_on_triangle
     from soma_core.geometry.rotations import axis_angle_to_matrix
     from soma_core.io.pickled_arrays import read_pickled_arrays
+    from soma_core.native.skinned import pose_skinned
     from soma_core.npz import open_npz_file
     from soma_core.obj import read_obj, write_obj
     from soma_core.paths import data_dir, model_folders
-    from soma_core.plugin.checks import Check, CheckFailedError, Level, check
+    from soma_core.plugin.checks import Check, CheckFailedError, CheckNotRunError, Level, check
     from soma_core.plugin.errors import BrokenBackendError, PluginError
     from soma_core.plugin.hookspecs import hookimpl
     from soma_core.plugin.registry import Registry
@@ -27,8 +28,10 @@ if TYPE_CHECKING:
         API_VERSION,
         Axis,
         BackendSpec,
+        Expressions,
         FileNeeded,
         Generator,
+        HasExpressions,
         HasLinearBasis,
         HasPosed,
         HasPoseVector,
@@ -36,6 +39,8 @@ if TYPE_CHECKING:
         HasSkinning,
         HasTriangles,
         LinearBasis,
+        ModelMotion,
+        MotionFormat,
         Parameter,
         SkinnedModel,
         Unit,
@@ -50,9 +55,12 @@ __all__ = [
     "BrokenBackendError",
     "Check",
     "CheckFailedError",
+    "CheckNotRunError",
     "ClosestFaces",
+    "Expressions",
     "FileNeeded",
     "Generator",
+    "HasExpressions",
     "HasLinearBasis",
     "HasPoseVector",
     "HasPosed",
@@ -61,6 +69,8 @@ __all__ = [
     "HasTriangles",
     "Level",
     "LinearBasis",
+    "ModelMotion",
+    "MotionFormat",
     "Parameter",
     "PluginError",
     "Registry",
@@ -79,6 +89,7 @@ __all__ = [
     "hookimpl",
     "model_folders",
     "open_npz_file",
+    "pose_skinned",
     "read_obj",
     "read_pickled_arrays",
     "refuse_unreadable",
@@ -89,12 +100,13 @@ _HOMES = {
     # Hooks, the declaration and the generator with its capabilities
     "soma_core.plugin.hookspecs": ["hookimpl"],
     "soma_core.plugin.spec": [
-        *("API_VERSION", "Axis", "BackendSpec", "FileNeeded", "Generator", "HasLinearBasis", "HasPosed"),
+        *("API_VERSION", "Axis", "BackendSpec", "Expressions", "FileNeeded", "Generator", "HasExpressions"),
+        *("HasLinearBasis", "HasPosed", "ModelMotion", "MotionFormat"),
         *("HasPoseVector", "HasRandomPoses", "HasSkinning", "HasTriangles", "LinearBasis", "Parameter"),
         *("SkinnedModel", "Unit", "WrapPair"),
     ],
     # Checks of its own, and the registry that its tests ask
-    "soma_core.plugin.checks": ["Check", "CheckFailedError", "Level", "check"],
+    "soma_core.plugin.checks": ["Check", "CheckFailedError", "CheckNotRunError", "Level", "check"],
     "soma_core.plugin.registry": ["Registry"],
     "soma_core.plugin.errors": ["BrokenBackendError", "PluginError"],
     # Files of the user, read without running them, and what is derived from them
@@ -108,6 +120,7 @@ _HOMES = {
     "soma_core.topology.closest": ["ClosestFaces"],
     "soma_core.geometry.barycentric": ["closest_point_on_triangle"],
     "soma_core.geometry.rotations": ["axis_angle_to_matrix"],
+    "soma_core.native.skinned": ["pose_skinned"],
 }
 
 __getattr__, __dir__ = lazy_names(__name__, _HOMES)

@@ -9,7 +9,7 @@ from typing import Any, Literal, TypeAlias, get_args
 
 from soma_core.errors import InputError, SomaError
 
-__all__ = ["Check", "CheckFailedError", "Level", "check"]
+__all__ = ["Check", "CheckFailedError", "CheckNotRunError", "Level", "check"]
 
 Level = Literal["core", "full"]
 """core: seconds, what every change should run; full: everything."""
@@ -32,6 +32,10 @@ class CheckFailedError(SomaError, AssertionError):
         super().__init__(f"{where}: got {got}, expected {expected}. {fix}")
 
 
+class CheckNotRunError(SomaError):
+    """A check cannot tell here whether the backend holds what it asks; the text says why."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class Check:
     """One thing that a backend must do.
@@ -43,6 +47,7 @@ class Check:
         run: passes by returning; fails by raising, best :class:`CheckFailedError`.
         needs: ids of checks that must have passed before; this one is not run otherwise.
         unless: gives the reason why the check does not apply to a backend, or an empty text.
+        mend: what to do where it fails, in a few words.
     """
 
     id: str
@@ -51,6 +56,7 @@ class Check:
     run: Body
     needs: tuple[str, ...] = ()
     unless: Callable[[Any], str] | None = None
+    mend: str = ""
 
     def __post_init__(self) -> None:
         if not _KEBAB.fullmatch(self.id.rpartition("/")[2]):
@@ -75,11 +81,14 @@ def check(
     level: Level = "full",
     needs: tuple[str, ...] = (),
     unless: Callable[[Any], str] | None = None,
+    mend: str = "",
 ) -> Callable[[Body], Check]:
     """Turn a function into a :class:`Check`; the first line of its docstring is the summary."""
 
     def made(run: Body) -> Check:
         summary = (run.__doc__ or "").strip().partition("\n")[0].rstrip(".")
-        return Check(id=check_id, level=level, summary=summary, run=run, needs=needs, unless=unless)
+        return Check(
+            id=check_id, level=level, summary=summary, run=run, needs=needs, unless=unless, mend=mend
+        )
 
     return made

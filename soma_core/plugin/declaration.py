@@ -6,16 +6,39 @@ import dataclasses
 import difflib
 import math
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from numbers import Real
 from pathlib import Path
 from typing import Any, get_args, get_type_hints
 
-from soma_core.plugin.spec import Axis, BackendSpec, FileNeeded, Parameter, Unit, WrapPair
+from soma_core.plugin.errors import PluginError
+from soma_core.plugin.spec import (
+    Axis,
+    BackendSpec,
+    Expressions,
+    FileNeeded,
+    ModelMotion,
+    MotionFormat,
+    Parameter,
+    SkinnedModel,
+    Unit,
+    WrapPair,
+)
 
-__all__ = ["checks_problem", "did_you_mean", "spec_problem"]
+__all__ = [
+    "checks_problem",
+    "did_you_mean",
+    "expressions_problem",
+    "formats_problem",
+    "motion_problem",
+    "refuse_posed",
+    "skinned_problem",
+    "spec_problem",
+    "tensor_problem",
+]
 
 _NAME = re.compile(r"[A-Za-z_][A-Za-z0-9_-]*")
+_SUFFIX = re.compile(r"\.[a-z0-9]+")
 
 
 def did_you_mean(name: str, known: Iterable[str]) -> str:
@@ -123,4 +146,115 @@ def checks_problem(checks: Iterable[object]) -> str | None:
     for check in checks:
         if not (isinstance(getattr(check, "id", None), str) and callable(getattr(check, "run", None))):
             return f"soma_checks gave {check!r:.80}, expected a soma_core.plugin.Check"
+    return None
+
+
+def formats_problem(formats: Iterable[object]) -> str | None:
+    """Say which of the motion formats that a plugin gives is none, or return None."""
+    names = set()
+    for each in formats:
+        if not isinstance(each, MotionFormat):
+            return f"soma_motions gave {each!r:.80}, expected a soma_core.plugin.MotionFormat"
+        if not (isinstance(each.name, str) and _NAME.fullmatch(each.name)) or each.name in names:
+            return f"the motion format {each.name!r} has no name of its own; use letters, digits, _ and -"
+        names.add(each.name)
+        for key in ("suffixes", "keys"):
+            texts = getattr(each, key)
+            if not (isinstance(texts, tuple) and all(isinstance(text, str) for text in texts)):
+                return f"{key} of the motion format {each.name} is {texts!r}, expected a tuple of texts"
+        if not each.suffixes or not all(_SUFFIX.fullmatch(suffix) for suffix in each.suffixes):
+            return f"suffixes of the motion format {each.name} are {each.suffixes!r}, expected like ('.npz',)"
+        calls = [call for call in (each.read, each.write) if call is not None]
+        if not calls or not all(map(callable, calls)):
+            return f"the motion format {each.name} has neither read nor write that can be called"
+    return None
+
+
+def tensor_problem(value: Any, shape: tuple[int, ...], *, like: Any = None) -> str | None:
+    """Say why a value is no finite tensor of a shape, in the dtype and on the device of another; or None."""
+    if not (hasattr(value, "shape") and hasattr(value, "isfinite")):
+        return f"{type(value).__name__}, expected a tensor {shape}"
+    if tuple(value.shape) != shape:
+        return f"a tensor {tuple(value.shape)}, expected {shape}"
+    if like is not None and (value.dtype, value.device) != (like.dtype, like.device):
+        return f"{value.dtype} on {value.device}, expected {like.dtype} on {like.device}"
+    return None if bool(value.isfinite().all()) else "numbers that are not finite, expected finite ones"
+
+
+_WEIGHTS = 1e-3
+"""How far weights may sum from 1, or lie below 0: files round them."""
+
+
+def _range(values: Any) -> str:
+    return f"{float(values.min()):g} to {float(values.max()):g}"
+
+
+def skinned_problem(model: Any, batch: int, count: int) -> str | None:
+    """Say what is wrong with what ``skinning()`` returned for `batch` bodies of `count` vertices; or None."""
+    if not isinstance(model, SkinnedModel):
+        return f"skinning returned {type(model).__name__}, expected a SkinnedModel"
+    names, parents = model.joint_names, model.parents
+    if not (isinstance(names, tuple) and names and len(set(names)) == len(names)):
+        return f"joint_names of skinning is {names!r:.60}, expected a tuple of names, each once"
+    if (
+        len(parents) != len(names)
+        or not all(-1 < up < at for at, up in enumerate(parents) if at)
+        or parents[0] != -1
+    ):
+        return f"parents of skinning is {parents!r:.60}, expected -1, then for each joint one before it"
+    joints = len(names)
+    for key, shape in {
+        "rest": (batch, count, 3),
+        "joints": (batch, joints, 3),
+        "weights": (count, joints),
+    }.items():
+        problem = tensor_problem(getattr(model, key), shape)
+        if problem is not None:
+            return f"{key} of skinning is {problem}"
+    low, sums = float(model.weights.min()), model.weights.sum(-1)
+    if not (sums - 1).abs().max() <= _WEIGHTS or not low >= -_WEIGHTS:
+        return f"weights of skinning are {low:g} or more, sums {_range(sums)}, expected rows that sum to 1"
+    if model.pose_offsets is not None and not callable(model.pose_offsets):
+        return f"pose_offsets of skinning is {type(model.pose_offsets).__name__}, expected a function or None"
+    return None
+
+
+def expressions_problem(found: Any, count: int) -> str | None:
+    """Say what is wrong with what ``expressions()`` returned for a mesh of `count` vertices; or None."""
+    if not isinstance(found, Expressions):
+        return f"expressions returned {type(found).__name__}, expected Expressions"
+    if not (isinstance(found.names, tuple) and found.names and len({*found.names}) == len(found.names)):
+        return f"names of expressions is {found.names!r:.60}, expected a tuple of names, each once"
+    problem = tensor_problem(found.basis, (len(found.names), count, 3))
+    return f"the basis of expressions is {problem}" if problem else None
+
+
+def refuse_posed(found: Any, frames: int) -> None:
+    """Refuse what ``posed()`` returned where it is no mesh of each of the frames.
+
+    Raises:
+        PluginError: it is none.
+    """
+    shape = tuple(getattr(found, "shape", ()))
+    if len(shape) != 3 or shape[0] != frames or shape[2] != 3:
+        kind = f"a tensor {shape}" if shape else type(found).__name__
+        raise PluginError(
+            f"posed returned {kind}, expected ({frames}, n, 3)", fix="Return the posed vertices"
+        )
+
+
+def motion_problem(motion: Any) -> str | None:
+    """Say why what the ``read`` of a motion format returned is no motion; or None."""
+    if not isinstance(motion, ModelMotion):
+        return f"read returned {type(motion).__name__}, expected a ModelMotion"
+    if not (isinstance(motion.pose, Mapping) and isinstance(motion.params, Mapping) and motion.pose):
+        kinds = f"{type(motion.pose).__name__} and {type(motion.params).__name__}"
+        return f"pose and params of a motion are {kinds}, expected arrays by name"
+    frames = {len(value) if hasattr(value, "__len__") else -1 for value in motion.pose.values()}
+    if len(frames) != 1 or min(frames) < 1:
+        return f"pose of a motion has arrays of {sorted(frames)} frames, expected as many in each"
+    if not _is_finite(motion.fps) or not motion.fps > 0:
+        return f"fps of a motion is {motion.fps!r}, expected frames per second"
+    if motion.up is not None and motion.up not in get_args(Axis):
+        return f"up of a motion is {motion.up!r}, expected one of {', '.join(get_args(Axis))}, or None"
     return None

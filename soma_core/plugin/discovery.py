@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib.metadata
 import importlib.util
 import logging
+import os
 import re
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
@@ -16,11 +17,13 @@ from soma_core.plugin.hookspecs import ENTRY_POINT_GROUP
 __all__ = [
     "CORE_DISTRIBUTION",
     "CORE_PACKAGE",
+    "Damaged",
     "EntryPointLike",
     "Offer",
     "config_folder",
     "find_offers",
     "normalised",
+    "read_installed",
 ]
 
 CORE_DISTRIBUTION, CORE_PACKAGE = "soma-body-core", "soma_core"
@@ -74,6 +77,20 @@ class Offer:
         """Who offers it, as messages name it: distribution and version."""
         return f"{self.distribution} {self.version}".strip()
 
+    @property
+    def of_core(self) -> bool:
+        """Whether the core itself offers it."""
+        return self.package == CORE_PACKAGE and normalised(self.distribution) == CORE_DISTRIBUTION
+
+
+@dataclass(frozen=True, kw_only=True)
+class Damaged:
+    """An installed distribution whose metadata cannot be read: its name, where it lies, and why not."""
+
+    distribution: str
+    folder: str
+    cause: str
+
 
 def normalised(distribution: str) -> str:
     """Spelling of a distribution name that pip treats as equal (PEP 503)."""
@@ -81,13 +98,13 @@ def normalised(distribution: str) -> str:
 
 
 def find_offers(entry_points: Iterable[EntryPointLike] | None = None) -> dict[str, tuple[Offer, ...]]:
-    """Group the installed entry points by backend name, sorted by name.
+    """Group entry points, by default the installed ones, by backend name, sorted by name.
 
     A distribution seen twice (an editable install beside a stale wheel) counts once: the first on
     ``sys.path`` wins, as it does for imports. More than one offer under a name is a conflict.
     """
     found: dict[tuple[str, str], Offer] = {}
-    for point in _installed() if entry_points is None else entry_points:
+    for point in read_installed()[0] if entry_points is None else entry_points:
         distribution = getattr(point.dist, "name", None) or "unknown distribution"
         version = getattr(point.dist, "version", None) or ""
         offer = Offer(
@@ -100,21 +117,27 @@ def find_offers(entry_points: Iterable[EntryPointLike] | None = None) -> dict[st
     return grouped
 
 
-def _installed() -> Iterable[EntryPointLike]:
-    """Entry points of our group; where one distribution's metadata is damaged, those of all others."""
+def read_installed() -> tuple[tuple[EntryPointLike, ...], tuple[Damaged, ...]]:
+    """Entry points of our group, and the distributions whose metadata cannot be read; they hurt no other."""
     try:
-        return importlib.metadata.entry_points(group=ENTRY_POINT_GROUP)
+        return tuple(importlib.metadata.entry_points(group=ENTRY_POINT_GROUP)), ()
     except Exception as error:  # whatever a damaged file makes of the standard library's parser
         _log.debug("reading the distributions one by one: %r", error)
-    points: dict[str, Iterable[EntryPointLike]] = {}
-    for distribution in importlib.metadata.distributions():
+        # PyTorch (2.5 on) looks for device backends in the same way when it is imported, and would die of it:
+        # https://docs.pytorch.org/tutorials/unstable/python_extension_autoload.html
+        os.environ.setdefault("TORCH_DEVICE_BACKEND_AUTOLOAD", "0")
+    points: dict[str, tuple[EntryPointLike, ...]] = {}
+    damaged: list[Damaged] = []
+    for number, distribution in enumerate(importlib.metadata.distributions()):
+        folder, name = str(distribution.locate_file("")), ""
         try:
+            name = distribution.metadata["Name"] or ""
             found = distribution.entry_points.select(group=ENTRY_POINT_GROUP)
-            points.setdefault(normalised(distribution.name or ""), found)
+            points.setdefault(normalised(name) or str(number), tuple(found))
         except Exception as error:
-            where = distribution.locate_file("")
-            _log.warning("the metadata of %s in %s is damaged (%r)", distribution.name, where, error)
-    return [point for several in points.values() for point in several]
+            cause = f"{type(error).__name__}: {' '.join(str(error).split())}"
+            damaged.append(Damaged(distribution=name or "a distribution", folder=folder, cause=cause))
+    return tuple(point for several in points.values() for point in several), tuple(damaged)
 
 
 def config_folder(offer: Offer) -> Path | None:

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import pluggy
 
 from soma_core.plugin.checks import Check
-from soma_core.plugin.spec import BackendSpec, Generator
+from soma_core.plugin.spec import BackendSpec, Generator, MotionFormat
 
 if TYPE_CHECKING:
     import torch
@@ -23,6 +23,7 @@ __all__ = [
     "soma_checks",
     "soma_convert",
     "soma_generator",
+    "soma_motions",
 ]
 
 PROJECT = "soma"
@@ -39,9 +40,13 @@ def soma_backend() -> BackendSpec:  # type: ignore[empty-body]
 
 @hookspec(firstresult=True)
 def soma_generator(  # type: ignore[empty-body]
-    spec: BackendSpec, device: torch.device, dtype: torch.dtype, options: Mapping[str, Any]
+    spec: BackendSpec, device: torch.device, dtype: torch.dtype, options: Any
 ) -> Generator:
-    """Build the native generator on `device` with floating type `dtype`."""
+    """Build the native generator on `device` with floating type `dtype`.
+
+    `options` is an instance of the dataclass that the declaration names, checked; None where it names none.
+    A plugin of api 1 gets its fields as a dictionary.
+    """
 
 
 @hookspec
@@ -55,3 +60,8 @@ def soma_convert(source: Path, output: Path | None) -> Sequence[Path]:  # type: 
 
     `output` is the file to write; None leaves the choice to the plugin.
     """
+
+
+@hookspec
+def soma_motions() -> Sequence[MotionFormat]:  # type: ignore[empty-body]
+    """Name the motion files that ``soma convert`` reads or writes with this backend. Optional."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import textwrap
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
@@ -10,11 +11,19 @@ from soma_core.paths import configs_dir
 from soma_core.plugin.discovery import CORE_PACKAGE, config_folder
 from soma_core.plugin.errors import BackendError
 from soma_core.plugin.installation import local_source
+from soma_core.plugin.known import KNOWN_BACKENDS
 from soma_core.plugin.options import option_rows
 from soma_core.plugin.registry import Entry, Registry
-from soma_core.plugin.spec import BackendSpec
+from soma_core.plugin.spec import API_VERSION, BackendSpec
 
-__all__ = ["declaration", "declaration_text", "entries_json", "entries_text", "error_document"]
+__all__ = [
+    "declaration",
+    "declaration_text",
+    "entries_json",
+    "entries_text",
+    "error_document",
+    "known_text",
+]
 
 
 def _aligned(rows: Sequence[Sequence[str]]) -> list[str]:
@@ -134,14 +143,17 @@ def _wrap(spec: BackendSpec) -> dict[str, Any] | None:
     }
 
 
-def declaration_text(document: Mapping[str, Any]) -> str:
-    """What :func:`declaration` returned, for people: facts, then options, files and parameters."""
+def declaration_text(document: Mapping[str, Any], *, every: bool = False) -> str:
+    """What :func:`declaration` returned, for people: facts, options, files and parameters.
+
+    Many parameters that differ in nothing but their names are one row, which names all if `every`.
+    """
     source = f", installed from {document['source']}" if document["source"] else ""
     facts = [
         ("backend", document["name"]),
         ("about", document["description"]),
         ("distribution", f"{document['distribution']} {document['version']}{source}"),
-        ("plugin", f"{document['plugin']} (api {document['api']})"),
+        ("plugin", f"{document['plugin']} ({_api(document['api'])})"),
         ("config", document["config"] or _told(document["config_error"]) or "none: only for Python"),
         ("licence", document["licence"]),
         ("url", document["url"]),
@@ -155,9 +167,28 @@ def declaration_text(document: Mapping[str, Any]) -> str:
     lines += _table("options (backend.options)", [_option_row(item) for item in document["options"]])
     groups = dict.fromkeys(item["group"] for item in document["params"])
     for group in groups:
-        rows = [_parameter_row(item) for item in document["params"] if item["group"] == group]
-        lines += _table(group or "parameters (backend.params)", rows)
+        items = [item for item in document["params"] if item["group"] == group]
+        lines += _parameters(group or "parameters (backend.params)", items, every=every)
     return "\n".join(lines)
+
+
+_ALIKE = 10
+"""Parameters that differ in nothing but their names are one row from here on."""
+
+
+def _parameters(heading: str, items: Sequence[Mapping[str, Any]], *, every: bool) -> list[str]:
+    """A table of parameters, or one row and the names where all of many say the same."""
+    rows = [_parameter_row(item) for item in items]
+    if len({row[1:] for row in rows}) > 1 or len(rows) < _ALIKE:
+        return _table(heading, rows)
+    shown = ", ".join(row[0] for row in (rows if every else rows[:_ALIKE]))
+    more = "" if every or len(rows) == _ALIKE else f" and {len(rows) - _ALIKE} more: --all names them"
+    names = textwrap.wrap(shown + more, 106, break_long_words=False, break_on_hyphens=False)
+    return ["", f"{heading}: {len(rows)}, each {'  '.join(rows[0][1:])}", *(f"  {line}" for line in names)]
+
+
+def _api(version: int) -> str:
+    return f"api {version}" + (f", the newest is {API_VERSION}" if version < API_VERSION else "")
 
 
 def _told(error: Mapping[str, str] | None) -> str:
@@ -218,3 +249,14 @@ def _parameter_row(item: Mapping[str, Any]) -> tuple[str, ...]:
     low, high = item["range"]
     default = f"default {item['default']:g}"
     return (item["name"], shape, default, f"{low:g} to {high:g}", item["description"])
+
+
+def known_text(installed: Iterable[str]) -> str:
+    """The backends that the project knows of, with the licences of the models, for people."""
+    there = set(installed)
+    rows = [("BACKEND", "INSTALLED", "LICENCE OF THE MODEL", "MODEL", "YOU SUPPLY")]
+    rows += [
+        (each.name, "yes" if each.name in there else "no", each.licence, each.model, each.files or "nothing")
+        for each in KNOWN_BACKENDS.values()
+    ]
+    return "\n".join([*_aligned(rows), "", "no index has them: pip install ./plugins/FOLDER in a checkout"])

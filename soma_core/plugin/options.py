@@ -16,7 +16,7 @@ from soma_core.errors import InputError
 from soma_core.plugin.declaration import did_you_mean
 from soma_core.plugin.spec import BackendSpec
 
-__all__ = ["OptionRow", "checked_options", "option_rows"]
+__all__ = ["OptionRow", "checked_options", "option_rows", "options_by_name"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -37,8 +37,8 @@ def option_rows(options: type | None) -> tuple[OptionRow, ...]:
     )
 
 
-def checked_options(spec: BackendSpec, options: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the options by name, with the defaults of ``spec.options`` filled in.
+def checked_options(spec: BackendSpec, options: Mapping[str, Any]) -> Any:
+    """Return the options as an instance of ``spec.options``, defaults filled in; None where there are none.
 
     Values are checked against the annotations of the dataclass: plain classes, ``None``, unions, ``Literal``,
     enums, paths, lists, tuples, dictionaries and nested dataclasses. An integer is taken for a float, a text
@@ -57,9 +57,13 @@ def checked_options(spec: BackendSpec, options: Mapping[str, Any]) -> dict[str, 
             fix="Leave it out",
         )
     if spec.options is None:
-        return {}
-    made = _Value("backend.options", f"See: soma backends show {spec.name}").instance(options, spec.options)
-    return {field.name: getattr(made, field.name) for field in _fields(spec.options)}
+        return None
+    return _Value("backend.options", f"See: soma backends show {spec.name}").instance(options, spec.options)
+
+
+def options_by_name(options: Any) -> dict[str, Any]:
+    """Fields of what :func:`checked_options` returned, as plugins of api 1 get them."""
+    return {field.name: getattr(options, field.name) for field in _fields(type(options))} if options else {}
 
 
 def _fields(options: type | None) -> list[dataclasses.Field[Any]]:

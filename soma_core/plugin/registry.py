@@ -4,24 +4,27 @@ from __future__ import annotations
 
 import functools
 import os
-import shlex
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import AbstractContextManager, contextmanager
-from dataclasses import dataclass, field
+from contextlib import AbstractContextManager, contextmanager, suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 from soma_core._version import __version__
 from soma_core.errors import InputError
-from soma_core.plugin.causes import cause_and_fix, remedy, supply
+from soma_core.plugin.causes import supply
 from soma_core.plugin.checks import Check
 from soma_core.plugin.configs import PluginConfigs, find_configs
-from soma_core.plugin.declaration import checks_problem, did_you_mean, spec_problem
-from soma_core.plugin.discovery import CORE_DISTRIBUTION, EntryPointLike, Offer, find_offers
+from soma_core.plugin.declaration import checks_problem, did_you_mean, formats_problem, spec_problem
+from soma_core.plugin.discovery import (
+    CORE_DISTRIBUTION,
+    EntryPointLike,
+    Offer,
+    find_offers,
+    read_installed,
+)
 from soma_core.plugin.errors import (
     BackendConflictError,
-    BackendDisabledError,
     BackendError,
     BackendWarning,
     BrokenBackendError,
@@ -30,51 +33,41 @@ from soma_core.plugin.errors import (
     UnknownBackendError,
 )
 from soma_core.plugin.hooks import hook_manager
-from soma_core.plugin.installation import core_requirement, reinstall_command
-from soma_core.plugin.known import KNOWN_BACKENDS, install_line, publication
-from soma_core.plugin.options import checked_options
-from soma_core.plugin.spec import API_VERSION, OLDEST_API_VERSION, BackendSpec, Generator, WrapPair
+from soma_core.plugin.installation import newer_core, reinstall_command
+from soma_core.plugin.known import KNOWN_BACKENDS, publication
+from soma_core.plugin.options import checked_options, options_by_name
+from soma_core.plugin.record import (
+    Entry,
+    Record,
+    State,
+    damaged_entry,
+    isolated,
+    option_in_error,
+    refuse_rival,
+    settle,
+)
+from soma_core.plugin.spec import (
+    API_VERSION,
+    OLDEST_API_VERSION,
+    BackendSpec,
+    Generator,
+    MotionFormat,
+    WrapPair,
+)
 
 if TYPE_CHECKING:
-    import pluggy
     import torch
 
 
 __all__ = ["Entry", "Registry", "State", "WrapMaker", "default_registry"]
 
+_OPTIONS_SINCE = 2
+"""The api from which on options are the declared dataclass."""
+
 _CORE = f"{CORE_DISTRIBUTION} {__version__}"
 
 WrapMaker = Callable[[str, Mapping[str, Any]], None]
 """Makes the wrap pair of a backend where its declaration names it."""
-
-State = Literal["found", "declared", "built", "blocked", "conflict", "broken"]
-
-
-@dataclass(frozen=True, kw_only=True)
-class Entry:
-    """One line of ``soma backends``: an offer and how far it came in this process."""
-
-    name: str
-    distribution: str
-    version: str
-    state: State
-    error: BackendError | None = None
-
-
-@dataclass
-class _Record:
-    """What the registry knows of one name; it only ever moves forward."""
-
-    name: str
-    offers: tuple[Offer, ...]
-    state: State = "found"
-    error: BackendError | None = None
-    manager: pluggy.PluginManager | None = None
-    spec: BackendSpec | None = None
-    who: str = field(init=False)
-
-    def __post_init__(self) -> None:
-        self.who = f'backend "{self.name}" ({" and ".join(offer.source for offer in self.offers)})'
 
 
 class Registry:
@@ -97,10 +90,23 @@ class Registry:
             text = os.environ.get("SOMA_BACKENDS", "")
             allowed = [name.strip() for name in text.split(",") if name.strip()]
         self._allowed = frozenset(allowed)
+        self._points = None if entry_points is None else tuple(entry_points)
         self._wrap_maker: WrapMaker | None = None
-        self._records = {name: _Record(name, offers) for name, offers in find_offers(entry_points).items()}
+        points, self._damaged = read_installed() if self._points is None else (self._points, ())
+        self._records: dict[str, Record] = {}
+        self._rivals: list[Record] = []
+        for name, offers in find_offers(points).items():
+            own = tuple(offer for offer in offers if offer.of_core)
+            self._records[name] = Record(name, own or offers)
+            self._rivals += [Record(name, (offer,)) for offer in offers if own and not offer.of_core]
         for record in self._records.values():
-            self._settle(record)
+            settle(record, self._allowed)
+        for record in self._rivals:
+            refuse_rival(record)
+
+    def __reduce__(self) -> tuple[object, ...]:
+        """Read what is installed anew where the registry is unpickled, or take the given entry points."""
+        return _registry_of, (self._points, tuple(sorted(self._allowed)))
 
     def names(self) -> tuple[str, ...]:
         """Names that can be asked for: all but the blocked, the conflicting and those that failed."""
@@ -111,18 +117,17 @@ class Registry:
         )
 
     def entries(self) -> tuple[Entry, ...]:
-        """Every offer with its state, sorted by name; a conflict shows once for each distribution."""
-        return tuple(
-            Entry(
-                name=record.name,
-                distribution=offer.distribution,
-                version=offer.version,
-                state=record.state,
-                error=record.error,
-            )
-            for record in self._records.values()
-            for offer in record.offers
-        )
+        """Every offer with its state, sorted by name; a conflict shows once for each distribution.
+
+        Distributions whose metadata cannot be read come last, under no name.
+        """
+        records = sorted((*self._records.values(), *self._rivals), key=lambda record: record.name)
+        found = [entry for record in records for entry in record.entries]
+        return (*found, *map(damaged_entry, self._damaged))
+
+    def tell(self, name: str, state: State, error: BackendError | None = None) -> None:
+        """Take over how far backend `name` came in another process, for :meth:`entries`."""
+        self._record(name).state, self._record(name).error = state, error
 
     def offers(self, name: str) -> tuple[Offer, ...]:
         """Return who offers backend `name`, without importing a plugin; several where they conflict.
@@ -132,6 +137,16 @@ class Registry:
         """
         return self._record(name).offers
 
+    def usable(self, name: str) -> None:
+        """Refuse a name that no plugin needs to be imported to refuse.
+
+        Raises:
+            BackendError: unknown, blocked, conflicting, or failed before.
+        """
+        record = self._record(name)
+        if record.error is not None and record.spec is None:
+            raise record.error.with_traceback(None)
+
     def spec(self, name: str) -> BackendSpec:
         """Return the declaration of backend `name`, importing its plugin on first use.
 
@@ -140,8 +155,7 @@ class Registry:
         """
         record = self._record(name)
         if record.spec is None:
-            if record.error is not None:
-                raise record.error.with_traceback(None)
+            self.usable(name)
             self._declare(record)
         assert record.spec is not None
         return record.spec
@@ -170,10 +184,11 @@ class Registry:
             self.wrap(name, options)
         self._check_files(record, spec, wrapped=wrapped)
         assert record.manager is not None
-        with _isolated(record, "build"):
+        with isolated(record, "build"), option_in_error(options or {}):
             checked = checked_options(spec, options or {})
+            given = options_by_name(checked) if spec.api < _OPTIONS_SINCE else checked
             generator = record.manager.hook.soma_generator(
-                spec=spec, device=device, dtype=dtype, options=checked
+                spec=spec, device=device, dtype=dtype, options=given
             )
             if not callable(getattr(generator, "rest", None)):
                 raise PluginError(f"soma_generator returned {type(generator).__name__} without a rest method")
@@ -204,7 +219,7 @@ class Registry:
         ours_to_make = pair is not None and pair.wrap in {needed.path for needed in spec.files}
         if self._wrap_maker is not None and pair and ours_to_make and not pair.wrap.is_file():
             self._check_files(record, spec, wrapped=False)
-            with _isolated(record, "wrap"):
+            with isolated(record, "wrap"):
                 self._wrap_maker(name, options or {})
         return pair
 
@@ -214,15 +229,7 @@ class Registry:
         Raises:
             BackendError: the backend is not usable, or what it gives are no checks.
         """
-        self.spec(name)
-        record = self._records[name]
-        assert record.manager is not None
-        with _isolated(record, "hooks"):
-            found = tuple(check for given in record.manager.hook.soma_checks() for check in given)
-            problem = checks_problem(found)
-            if problem is not None:
-                raise PluginError(problem)
-        return found
+        return self._given(name, "soma_checks", checks_problem)
 
     def convert(self, name: str, source: Path, output: Path | None = None) -> tuple[Path, ...]:
         """Let backend `name` turn a file of its model's makers into what it reads; return what it wrote.
@@ -233,10 +240,45 @@ class Registry:
         self.spec(name)
         record = self._records[name]
         assert record.manager is not None
-        with _isolated(record, "files"):
+        if not source.exists():
+            raise InputError(
+                "FILE", got=str(source), expected="a file that is there", fix="Correct the path."
+            )
+        with isolated(record, "files"):
             if not record.manager.hook.soma_convert.get_hookimpls():
                 raise PluginError("it reads its model as it is", fix=f"See: soma backends show {name}")
             return tuple(record.manager.hook.soma_convert(source=source, output=output))
+
+    def motion_formats(self) -> dict[str, tuple[str, MotionFormat]]:
+        """Return the files of motions that plugins read or write: name -> backend and format.
+
+        Plugins are imported for it; one that fails has none. The first backend of a name keeps it.
+        """
+        found: dict[str, tuple[str, MotionFormat]] = {}
+        for name in self.names():
+            with suppress(BackendError):  # said by whoever asks for the backend
+                for each in self.formats(name):
+                    found.setdefault(each.name, (name, each))
+        return found
+
+    def formats(self, name: str) -> tuple[MotionFormat, ...]:
+        """Return the motion files of backend `name`.
+
+        Raises:
+            BackendError: the backend is not usable, or what it gives are no formats.
+        """
+        return self._given(name, "soma_motions", formats_problem)
+
+    def _given(self, name: str, hook: str, problem_of: Callable[[Iterable[object]], str | None]) -> Any:
+        """What the optional hook of a backend lists, found to be sound."""
+        self.spec(name)
+        record = self._records[name]
+        with isolated(record, "hooks"):
+            found = tuple(each for given in getattr(record.manager.hook, hook)() for each in given)
+            problem = problem_of(found)
+            if problem is not None:
+                raise PluginError(problem)
+        return found
 
     def isolated(self, name: str, stage: Stage) -> AbstractContextManager[None]:
         """Return a context that turns whatever is raised inside into an error of backend `name`.
@@ -245,7 +287,7 @@ class Registry:
         InputError at ``build`` and ``rest``, which is about what the caller asked for. SOMA_STRICT=1 lets
         everything pass as it is.
         """
-        return _isolated(self._record(name), stage)
+        return isolated(self._record(name), stage)
 
     def config_dirs(self) -> tuple[tuple[str, Path], ...]:
         """Return (distribution, folder) of each plugin that ships hydra configs, importing none of them.
@@ -280,93 +322,48 @@ class Registry:
         usable = [record for record in self._records.values() if record.state not in ("blocked", "conflict")]
         return find_configs((record.offers[0] for record in usable), core=_CORE)
 
-    def _settle(self, record: _Record) -> None:
-        """Set aside what cannot be used whatever its plugin says."""
-        if self._allowed and record.name not in self._allowed:
-            record.state = "blocked"
-            record.error = BackendDisabledError(
-                who=record.who,
-                stage="lookup",
-                cause=f"SOMA_BACKENDS allows only {', '.join(sorted(self._allowed))}",
-                fix=f"Add {record.name} to SOMA_BACKENDS, or unset it",
-            )
-        elif len(record.offers) > 1:
-            record.state = "conflict"
-            record.error = BackendConflictError(
-                who=record.who,
-                stage="lookup",
-                cause=f"{len(record.offers)} distributions offer this name, so none of them is loaded",
-                fix=f"Keep one: pip uninstall {record.offers[-1].distribution}",
-            )
-
-    def _record(self, name: str) -> _Record:
+    def _record(self, name: str) -> Record:
         if name in self._records:
             return self._records[name]
         cause = f"no installed distribution offers it; installed are: {', '.join(self._records) or 'none'}"
-        line = install_line(name)
-        if line is None:
-            fix = did_you_mean(name, [*self._records, *KNOWN_BACKENDS]) or "See: soma backends list"
+        known = KNOWN_BACKENDS.get(name)
+        if known is not None:
+            fix = publication(known.distribution)
         else:
-            cause, fix = f"{cause} ({publication(name)})", f"Run: {line}"
+            fix = did_you_mean(name, [*self._records, *KNOWN_BACKENDS]) or "See: soma backends list"
         raise UnknownBackendError(who=f'backend "{name}"', stage="lookup", cause=cause, fix=fix)
 
-    def _declare(self, record: _Record) -> None:
+    def _declare(self, record: Record) -> None:
         """Import the plugin, register its hooks with a manager of its own, and check its declaration."""
-        with _isolated(record, "import"):
+        with isolated(record, "import"):
             plugin = record.offers[0].load()
-        with _isolated(record, "hooks"):
+        with isolated(record, "hooks"):
             manager = hook_manager(plugin, record.name)
             spec = manager.hook.soma_backend()
-        with _isolated(record, "spec"):
+        with isolated(record, "spec"):
             problem = spec_problem(spec, record.name)
             if problem is not None:
                 raise PluginError(problem)
             _check_api(record.offers[0], spec)
         record.manager, record.spec, record.state = manager, spec, "declared"
-        if spec.api < API_VERSION:
-            fix = f"Run: {reinstall_command(record.offers[0].distribution)}"
+        if spec.api < _OPTIONS_SINCE and spec.options is not None:  # what uses nothing that changed is as new
+            fix = reinstall_command(record.offers[0].distribution)
             warnings.warn(f"{record.who}: spec: {_spoken(spec)}. {fix}", BackendWarning, stacklevel=3)
 
-    def _check_files(self, record: _Record, spec: BackendSpec, *, wrapped: bool) -> None:
+    def _check_files(self, record: Record, spec: BackendSpec, *, wrapped: bool) -> None:
         pair = (spec.wrap.native, spec.wrap.wrap) if spec.wrap else ()
         for needed in spec.files:
             if needed.path in pair and not wrapped:
                 continue
-            with _isolated(record, "files"):
+            with isolated(record, "files"):
                 if not needed.path.exists():
                     raise PluginError(
                         f"{needed.description or 'a file'} is missing at {needed.path}", fix=supply(needed)
                     )
         for path in pair if wrapped else ():
-            with _isolated(record, "wrap"):
+            with isolated(record, "wrap"):
                 if not path.is_file():
                     raise PluginError(f"the wrap pair names {path}, which does not exist")
-
-
-@contextmanager
-def _isolated(record: _Record, stage: Stage) -> Iterator[None]:
-    """Turn whatever is raised at `stage` into the error of this record; see :meth:`Registry.isolated`."""
-    try:
-        yield
-    except KeyboardInterrupt:
-        raise
-    except BaseException as error:
-        if error is record.error:
-            raise
-        about_the_call = isinstance(error, InputError) and stage in ("build", "rest")
-        own_words = isinstance(error, PluginError)
-        if about_the_call or (os.environ.get("SOMA_STRICT") == "1" and not own_words):
-            raise
-        cause, fix = cause_and_fix(error)
-        if stage != "files":  # a plugin is not to blame for what its user has yet to supply
-            record.state = "broken"
-        record.error = BrokenBackendError(
-            who=record.who,
-            stage=stage,
-            cause=cause.rstrip(". "),
-            fix=fix or remedy(record.name, record.offers[0].distribution, stage),
-        )
-        raise record.error from (None if own_words else error)
 
 
 def _spoken(spec: BackendSpec) -> str:
@@ -377,10 +374,9 @@ def _spoken(spec: BackendSpec) -> str:
 def _check_api(offer: Offer, spec: BackendSpec) -> None:
     """Accept the contract versions that this core speaks."""
     if spec.api > API_VERSION:
-        requirement = core_requirement(offer.distribution)
-        raise PluginError(_spoken(spec), fix=f"Run: pip install --upgrade {shlex.quote(requirement)}")
+        raise PluginError(_spoken(spec), fix=newer_core(offer.distribution))
     if spec.api < OLDEST_API_VERSION:
-        raise PluginError(_spoken(spec), fix=f"Run: {reinstall_command(offer.distribution)}")
+        raise PluginError(_spoken(spec), fix=reinstall_command(offer.distribution))
 
 
 def default_registry() -> Registry:
@@ -394,3 +390,8 @@ def default_registry() -> Registry:
 @functools.cache
 def _registry_for(allowed: str, data: str) -> Registry:  # noqa: ARG001 - what declarations depend on
     return Registry(allowed=[name.strip() for name in allowed.split(",") if name.strip()])
+
+
+def _registry_of(points: tuple[EntryPointLike, ...] | None, allowed: tuple[str, ...]) -> Registry:
+    """Make a registry again, as pickle does."""
+    return Registry(points, allowed=allowed)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, Protocol, runtime_checkable
 
@@ -15,8 +15,10 @@ __all__ = [
     "OLDEST_API_VERSION",
     "Axis",
     "BackendSpec",
+    "Expressions",
     "FileNeeded",
     "Generator",
+    "HasExpressions",
     "HasLinearBasis",
     "HasPoseVector",
     "HasPosed",
@@ -24,14 +26,16 @@ __all__ = [
     "HasSkinning",
     "HasTriangles",
     "LinearBasis",
+    "ModelMotion",
+    "MotionFormat",
     "Parameter",
     "SkinnedModel",
     "Unit",
     "WrapPair",
 ]
 
-API_VERSION = 1
-"""Newest version of the plugin contract that this core speaks."""
+API_VERSION = 2
+"""Newest version of the plugin contract that this core speaks: since 2 options are the declared dataclass."""
 
 OLDEST_API_VERSION = 1
 """Oldest version of the plugin contract that this core still speaks."""
@@ -94,7 +98,8 @@ class BackendSpec:
 
     Attributes:
         name: entry-point name, ``backend=<name>`` and ``configs/backend/<name>.yaml``.
-        api: version of the contract the plugin was written for; 1 where the plugin does not say.
+        api: version of the contract the plugin was written for; 1 where it does not say. Of 1, options reach
+            ``soma_generator`` as a dictionary, since 2 as the declared dataclass.
         unit: unit of the generator's vertices and of the wrap pair.
         up, forward: the generator's axes. The body's left is ``up x forward``.
         wrap: the OBJ pair in the generator's unit; ``None`` when the native topology is the
@@ -248,3 +253,70 @@ class HasTriangles(Protocol):
     def triangles(self) -> Tensor:
         """Native vertex ids (t, 3), counter-clockwise seen from outside."""
         ...
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Expressions:
+    """Directions of a face: what one unit of each coefficient adds to the rest mesh.
+
+    Attributes:
+        names: of the coefficients, k of them.
+        basis: (k, n, 3) native unit and axes.
+    """
+
+    names: tuple[str, ...]
+    basis: Tensor
+
+
+@runtime_checkable
+class HasExpressions(Protocol):
+    """Optional capability: the face of the model."""
+
+    def expressions(self) -> Expressions:
+        """The named directions of the face."""
+        ...
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class ModelMotion:
+    """A motion in the terms of one native model: one body, and a pose for each frame.
+
+    Attributes:
+        params: the body, as for ``SomaLayer.identity``.
+        pose: what ``posed()`` takes, each an array (frames, ...): ``rotations`` (frames, J, 3) [rad] and
+            ``translation`` (frames, 3) of a model that tells its skinning, ``parameters`` (frames, p) of one
+            whose pose is a vector, anything of another that is only read.
+        fps: frames per second.
+        up: upward axis of the world that the pose is given in; None: the backend's own.
+        options: of the backend.
+        source: where the motion comes from, for files that say so.
+    """
+
+    params: Mapping[str, Any]
+    pose: Mapping[str, Any]
+    fps: float
+    up: Axis | None = None
+    options: Mapping[str, Any] = field(default_factory=dict)
+    source: str = ""
+
+
+@dataclass(frozen=True, kw_only=True)
+class MotionFormat:
+    """Files that hold motions of a backend's model, for ``soma convert``; from the hook ``soma_motions``.
+
+    A file is of this format where the core knows none of its own, the suffix is one of these, and the file
+    holds all the keys. Nothing of a plugin looks at a file before.
+
+    Attributes:
+        name: how reports call it.
+        suffixes: of its files, such as ``(".npz",)``.
+        keys: names that an NPZ, a pickle or a file of tensors holds; empty where the suffix says enough.
+        read: makes a motion of a file; needs ``posed()``. None where files are only written.
+        write: writes a motion to a path; needs ``skinning()`` or a pose vector. None: files are only read.
+    """
+
+    name: str
+    suffixes: tuple[str, ...]
+    keys: tuple[str, ...] = ()
+    read: Callable[[Path], ModelMotion] | None = None
+    write: Callable[[Path, ModelMotion], None] | None = None

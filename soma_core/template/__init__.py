@@ -1,5 +1,5 @@
-"""What ``soma backends new`` writes: a complete backend to start from."""
+"""What ``soma backends new`` writes: a complete backend to start from, and how one stays up to date."""
 
-from soma_core.template.distribution import write_backend
+from soma_core.template.distribution import update_backend, write_backend
 
-__all__ = ["write_backend"]
+__all__ = ["update_backend", "write_backend"]

@@ -22,6 +22,7 @@ from soma_core.rig import load_canonical
 from soma_core.rig.mesh import CanonicalMesh
 from soma_core.rig.skeleton import Rig
 from soma_core.skeleton.identity import Identity
+from soma_core.testing.global_state import changes, snapshot
 from soma_core.testing.import_probe import ImportProbe, probe_import
 from soma_core.testing.samples import Change, changed_rows, random_rows
 from soma_core.topology.correspondence import Correspondence, load_correspondence
@@ -78,6 +79,9 @@ class Context:
         options: options that it is built with.
         registry: where it is looked up.
         canonical: mesh and rig; default: the shipped ones.
+
+    Attributes:
+        first_changes: what building the first generator changed, which imports what it needs; None before.
     """
 
     def __init__(
@@ -91,6 +95,7 @@ class Context:
         self.name, self.options = name, dict(options or {})
         self.registry = registry or default_registry()
         self._canonical = canonical
+        self.first_changes: list[str] | None = None
 
     @property
     def offer(self) -> Offer:
@@ -169,8 +174,13 @@ class Context:
         return self.mesh.vertex_count if self.spec.wrap is None else len(self.wrap.native)
 
     def new_generator(self, *, dtype: torch.dtype = torch.float64, device: torch.device = CPU) -> Generator:
-        """Build another generator."""
-        return self.registry.generator(self.name, device=device, dtype=dtype, options=self.options)
+        """Build another generator; what the first one changes in the process is kept in `first_changes`."""
+        with torch.enable_grad():
+            before = snapshot()
+            made = self.registry.generator(self.name, device=device, dtype=dtype, options=self.options)
+            if self.first_changes is None:
+                self.first_changes = changes(before)
+        return made
 
     @functools.cached_property
     def generator(self) -> Generator:

@@ -12,9 +12,6 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
-import torch
-
 __all__ = ["changes", "kept", "snapshot"]
 
 
@@ -28,28 +25,41 @@ class _Part:
 
 
 def _numpy_state() -> tuple[Any, ...]:
+    import numpy as np
+
     name, key, *rest = np.random.get_state()  # noqa: NPY002 - the global one is the one to watch
     return (name, np.asarray(key).tobytes(), *rest)
 
 
 def _set_numpy_state(state: tuple[Any, ...]) -> None:
+    import numpy as np
+
     name, key, *rest = state
     np.random.set_state((name, np.frombuffer(key, np.uint32), *rest))  # noqa: NPY002
 
 
 def _torch_state() -> bytes:
+    import torch
+
     return torch.random.get_rng_state().numpy().tobytes()
 
 
 def _set_torch_state(state: bytes) -> None:
+    import numpy as np
+    import torch
+
     torch.random.set_rng_state(torch.from_numpy(np.frombuffer(state, np.uint8).copy()))
 
 
 def _default_device() -> str:
+    import torch
+
     return str(torch.get_default_device())
 
 
 def _set_default_device(device: str) -> None:
+    import torch
+
     torch.set_default_device(None if device == "cpu" else device)
 
 
@@ -72,24 +82,35 @@ def _set_filters(filters: list[Any]) -> None:
     warnings._filters_mutated()  # type: ignore[attr-defined]
 
 
-_PARTS = (
-    _Part("torch's default dtype", torch.get_default_dtype, torch.set_default_dtype),
+def _of(module: str, name: str) -> Callable[..., Any]:
+    """A function of a module that is looked up when it is called."""
+    return lambda *given: getattr(sys.modules[module], name)(*given)
+
+
+_HEAVY_PARTS = (
+    _Part("torch's default dtype", _of("torch", "get_default_dtype"), _of("torch", "set_default_dtype")),
     _Part("torch's default device", _default_device, _set_default_device),
     _Part("torch's random state", _torch_state, _set_torch_state),
-    _Part("torch's gradient mode", torch.is_grad_enabled, torch.set_grad_enabled),
-    _Part("torch's number of threads", torch.get_num_threads, torch.set_num_threads),
+    _Part("torch's gradient mode", _of("torch", "is_grad_enabled"), _of("torch", "set_grad_enabled")),
+    _Part("torch's number of threads", _of("torch", "get_num_threads"), _of("torch", "set_num_threads")),
     _Part(
         "torch's deterministic mode",
-        torch.are_deterministic_algorithms_enabled,
-        torch.use_deterministic_algorithms,
+        _of("torch", "are_deterministic_algorithms_enabled"),
+        _of("torch", "use_deterministic_algorithms"),
     ),
     _Part(
         "torch's matmul precision",
-        torch.get_float32_matmul_precision,
-        torch.set_float32_matmul_precision,
+        _of("torch", "get_float32_matmul_precision"),
+        _of("torch", "set_float32_matmul_precision"),
     ),
     _Part("NumPy's random state", _numpy_state, _set_numpy_state),
-    _Part("NumPy's error handling", np.geterr, lambda state: np.seterr(**state)),
+    _Part(
+        "NumPy's error handling", _of("numpy", "geterr"), lambda state: sys.modules["numpy"].seterr(**state)
+    ),
+)
+"""Of NumPy and torch; looked at where these are loaded, which loads nothing."""
+
+_LIGHT_PARTS = (
     _Part("Python's random state", random.getstate, random.setstate),
     _Part("the current folder", os.getcwd, os.chdir),
     _Part("the environment variables", lambda: dict(os.environ), _set_environment),
@@ -99,14 +120,18 @@ _PARTS = (
 )
 
 
+def _parts() -> tuple[_Part, ...]:
+    return _HEAVY_PARTS + _LIGHT_PARTS if "torch" in sys.modules else _LIGHT_PARTS
+
+
 def snapshot() -> dict[str, Any]:
-    """Read every part of the state, by name."""
-    return {part.name: part.read() for part in _PARTS}
+    """Read every part of the state, by name; those of NumPy and torch once these are loaded."""
+    return {part.name: part.read() for part in _parts()}
 
 
 def changes(before: dict[str, Any]) -> list[str]:
     """Names of the parts that differ from `before`."""
-    return [part.name for part in _PARTS if part.read() != before[part.name]]
+    return [part.name for part in _parts() if part.name in before and part.read() != before[part.name]]
 
 
 @contextmanager
@@ -117,6 +142,6 @@ def kept() -> Iterator[None]:
         yield
     finally:
         changed = changes(before)
-        for part in _PARTS:
+        for part in _parts():
             if part.name in changed:
                 part.restore(before[part.name])

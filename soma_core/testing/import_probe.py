@@ -16,6 +16,7 @@ from soma_core.plugin.discovery import Offer
 from soma_core.plugin.errors import BackendError, BackendWarning
 from soma_core.plugin.hookspecs import ENTRY_POINT_GROUP
 from soma_core.plugin.registry import Registry
+from soma_core.testing.global_state import changes, snapshot
 
 __all__ = ["ImportProbe", "main", "probe_import"]
 
@@ -31,11 +32,13 @@ class ImportProbe:
         packages: top-level packages that were imported.
         output: what was written to stdout and stderr, warnings included.
         error: what went wrong, or an empty text.
+        changed: what is global in the process and was changed.
     """
 
     packages: frozenset[str]
     output: str
     error: str
+    changed: tuple[str, ...] = ()
 
 
 def probe_import(offer: Offer) -> ImportProbe:
@@ -57,7 +60,10 @@ def probe_import(offer: Offer) -> ImportProbe:
             document = json.loads((folder / "result.json").read_text(encoding="utf-8"))
         except (OSError, ValueError):
             return ImportProbe(packages=frozenset(), output=said, error=f"an end with exit code {code}")
-    return ImportProbe(packages=frozenset(document["packages"]), output=said, error=document["error"])
+    return ImportProbe(
+        packages=frozenset(document["packages"]), output=said, error=document["error"],
+        changed=tuple(document["changed"]),
+    )  # fmt: skip
 
 
 def main(name: str, target: str, folder: str) -> None:
@@ -68,13 +74,14 @@ def main(name: str, target: str, folder: str) -> None:
     with open(Path(folder) / "output.txt", "wb") as stream:
         os.dup2(stream.fileno(), 1)
         os.dup2(stream.fileno(), 2)
-    error = ""
+    error, before = "", snapshot()
     try:
         registry.spec(name)
     except BackendError as reason:
         error = f"{reason.stage}: {reason.cause}"
     packages = sorted({module.partition(".")[0] for module in sys.modules})
-    (Path(folder) / "result.json").write_text(json.dumps({"packages": packages, "error": error}))
+    document = {"packages": packages, "error": error, "changed": changes(before)}
+    (Path(folder) / "result.json").write_text(json.dumps(document))
 
 
 if __name__ == "__main__":

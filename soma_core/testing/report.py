@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections import Counter
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
@@ -43,6 +44,21 @@ class Outcome:
     seconds: float = 0.0
     error: BaseException | None = field(default=None, repr=False)
 
+    def document(self) -> dict[str, Any]:
+        """The outcome as plain values, without the exception."""
+        return {
+            "id": self.check.id, "level": self.check.level, "summary": self.check.summary,
+            "state": self.state, "where": self.where, "got": self.got, "expected": self.expected,
+            "fix": self.fix, "reason": self.reason, "seconds": round(self.seconds, 3),
+        }  # fmt: skip
+
+    @classmethod
+    def of_document(cls, document: Mapping[str, Any]) -> Outcome:
+        """The outcome of a check that ran elsewhere."""
+        told = dict(document)
+        check = Check(id=told.pop("id"), level=told.pop("level"), summary=told.pop("summary"), run=_elsewhere)
+        return cls(check=check, **told)
+
     @property
     def failed(self) -> bool:
         """Whether this outcome fails the run."""
@@ -59,6 +75,11 @@ class Outcome:
                 "Take the id out of expected_failures."
             )
         return self.reason
+
+
+def _elsewhere(context: Any) -> None:
+    """Stand for a check that ran in another process."""
+    raise NotImplementedError
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -87,42 +108,43 @@ class Report:
     def text(self) -> str:
         """One line a check, then a sentence for each failure, then the count."""
         width = max((len(outcome.check.id) for outcome in self.outcomes), default=0)
-        lines = [f'backend "{self.backend}" ({self.distribution}), level {self.level}', ""]
+        lines = [self.heading, ""]
         for outcome in self.outcomes:
             shown = _SHOWN.get(outcome.state, outcome.state)
             said = outcome.check.summary if outcome.failed else outcome.reason or outcome.check.summary
             lines.append(f"  {shown:<14}  {outcome.check.id:<{width}}  {said}".rstrip())
-        for outcome in self.failed:
-            lines += ["", f"{outcome.check.id}:", f"  {outcome.sentence}"]
-        return "\n".join([*lines, "", self._total()])
+        return "\n".join([*lines, *self._failures(), "", self.total])
 
-    def _total(self) -> str:
+    def brief(self) -> str:
+        """One line for the backend, then a sentence for each failure."""
+        return "\n".join([f"{self.heading}: {self.total}", *self._failures()])
+
+    def _failures(self) -> list[str]:
+        return [line for each in self.failed for line in ("", f"{each.check.id}:", f"  {each.sentence}")]
+
+    @property
+    def heading(self) -> str:
+        """Whose checks, and which."""
+        return f'backend "{self.backend}" ({self.distribution}), level {self.level}'
+
+    @property
+    def total(self) -> str:
+        """How many checks ended in each way, and the time."""
         counts = Counter(outcome.state for outcome in self.outcomes)
         parts = [f"{count} {_SUMMED.get(state, state)}" for state, count in counts.items()]
         return f"{', '.join(parts)} in {sum(outcome.seconds for outcome in self.outcomes):.1f} s"
 
     def json(self) -> str:
         """The same as one JSON object."""
-        document: dict[str, Any] = {
+        return json.dumps(self.document(), indent=2)
+
+    def document(self) -> dict[str, Any]:
+        """The same as plain values."""
+        return {
             "backend": self.backend,
             "distribution": self.distribution,
             "level": self.level,
             "passed": not self.failed and not self.missing_files,
             "missing_files": [str(path) for path in self.missing_files],
-            "checks": [
-                {
-                    "id": outcome.check.id,
-                    "level": outcome.check.level,
-                    "summary": outcome.check.summary,
-                    "state": outcome.state,
-                    "where": outcome.where,
-                    "got": outcome.got,
-                    "expected": outcome.expected,
-                    "fix": outcome.fix,
-                    "reason": outcome.reason,
-                    "seconds": round(outcome.seconds, 3),
-                }
-                for outcome in self.outcomes
-            ],
+            "checks": [outcome.document() for outcome in self.outcomes],
         }
-        return json.dumps(document, indent=2)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import fnmatch
+import json
 import time
 import traceback
 import warnings
@@ -13,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from soma_core.errors import AssetError, InputError
-from soma_core.plugin.checks import Check, CheckFailedError, Level
+from soma_core.plugin.checks import Check, CheckFailedError, CheckNotRunError, Level
 from soma_core.plugin.declaration import did_you_mean
 from soma_core.plugin.errors import BackendError, BrokenBackendError
 from soma_core.plugin.registry import Registry, default_registry
@@ -97,6 +98,14 @@ class ConformanceRun:
         """Forget what was built, which may be large; outcomes stay."""
         self._context = None
 
+    def take(self, outcome: Outcome) -> None:
+        """Take over an outcome that is known already."""
+        self._outcomes[outcome.check.id] = outcome
+
+    def known(self, check_id: str) -> bool:
+        """Whether the outcome of a check is known."""
+        return check_id in self._outcomes
+
     def outcome(self, check_id: str) -> Outcome:
         """Outcome of one check, after those that it needs."""
         if check_id not in self._outcomes:
@@ -107,16 +116,18 @@ class ConformanceRun:
     def report(self) -> Report:
         """Run every check that has not been run."""
         outcomes = tuple(self.outcome(check_id) for check_id in self.checks)
-        offer = self.registry.offers(self.name)[0]
         return Report(
-            backend=self.name,
-            distribution=f"{offer.distribution} {offer.version}".strip(),
-            level=self.level,
-            outcomes=outcomes,
-            missing_files=self._missing_files(),
-        )
+            backend=self.name, distribution=self.distribution, level=self.level, outcomes=outcomes,
+            missing_files=self.missing_files(),
+        )  # fmt: skip
 
-    def _missing_files(self) -> tuple[Path, ...]:
+    @property
+    def distribution(self) -> str:
+        """Name and version of the distribution that offers the backend."""
+        return self.registry.offers(self.name)[0].source
+
+    def missing_files(self) -> tuple[Path, ...]:
+        """Declared files that are not there."""
         try:
             spec = self.registry.spec(self.name)
         except BackendError:
@@ -143,6 +154,8 @@ class ConformanceRun:
         except (KeyboardInterrupt, GeneratorExit):
             raise
         except BaseException as error:
+            if isinstance(error, CheckNotRunError):
+                return Outcome(check=check, state="not run", reason=str(error))
             if isinstance(error, BackendError) and error.stage == "files":
                 return Outcome(check=check, state="not run", reason=f"{error.cause}. {error.fix}")
             where, got, expected, fix = _told(error, check, self.registry.offers(self.name)[0].package)
@@ -176,6 +189,26 @@ def _as_expected(outcome: Outcome, reason: str) -> Outcome:
     if not reason or outcome.state not in changed:
         return outcome
     return replace(outcome, state=changed[outcome.state], reason=reason)
+
+
+def explained(check_id: str, *, as_json: bool = False) -> str:
+    """Say of a check of the core what must hold, when it runs, and how to mend what it finds.
+
+    Raises:
+        InputError: no check of that id.
+    """
+    known = {check.id: check for check in CORE_CHECKS}
+    if check_id not in known:
+        raise _unknown("ID", check_id, known)
+    check = known[check_id]
+    facts = {
+        "id": check.id, "holds": check.summary, "mend": check.mend, "level": check.level,
+        "needs": list(check.needs),
+    }  # fmt: skip
+    if as_json:
+        return json.dumps(facts, indent=2)
+    lines = [f"{check.id} ({check.level})", f"holds: {check.summary}", f"where it fails: {check.mend}"]
+    return "\n  ".join([*lines, f"needs: {', '.join(check.needs) or 'nothing'}"])
 
 
 def plugin_checks(registry: Registry, name: str) -> tuple[Check, ...]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import site as interpreter_site
 import sys
 from pathlib import Path
@@ -77,15 +76,16 @@ def test_of_two_backends_in_one_distribution_only_the_one_asked_for_is_loaded() 
         ("METADATA", ""),
     ],
 )
-def test_damaged_metadata_hurts_nobody_else(
-    site: Path, file: str, text: str, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_damaged_metadata_hurts_nobody_else(site: Path, file: str, text: str) -> None:
     Distribution(name="acme").install(site)
     (Distribution(name="bad").write_metadata(site) / file).write_text(text)
-    with caplog.at_level(logging.WARNING, logger="soma_core"):
-        assert {"acme", "soma"} <= set(_names())
+    registry = Registry()
+    assert {"acme", "soma"} <= set(registry.names())
+    damaged = [entry for entry in registry.entries() if entry.name == "-"]
     if "no value" in text:
-        assert f"the metadata of soma-backend-bad in {site} is damaged" in caplog.text
+        (row,) = damaged
+        assert (row.distribution, row.state) == ("soma-backend-bad", "broken")
+        assert f"soma-backend-bad in {site}: lookup: its metadata is damaged" in str(row.error)
 
 
 def test_blocked_backends_add_no_configs(site: Path) -> None:

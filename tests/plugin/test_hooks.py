@@ -77,7 +77,8 @@ def test_a_plugin_of_today_works_when_a_hook_gains_an_argument(arguments: tuple[
         ),
         (
             _sound(soma_zzz=lambda: SOUND),
-            "unknown hook 'soma_zzz'. The hooks are soma_backend, soma_checks, soma_convert, soma_generator",
+            "unknown hook 'soma_zzz'. The hooks are soma_backend, soma_checks, soma_convert, "
+            "soma_generator, soma_motions",
         ),
         (
             _sound(soma_generator=lambda spec, devise: None),

@@ -16,30 +16,30 @@ def test_from_an_index(site: Path) -> None:
     Distribution(name="acme").install(site)
     assert local_source(NAME) is None
     assert editable_folder(NAME) is None
-    assert reinstall_command(NAME) == "pip install --upgrade soma-backend-acme"
+    assert reinstall_command(NAME) == "Run: pip install --upgrade soma-backend-acme"
 
 
 def test_from_a_checkout(site: Path, tmp_path: Path) -> None:
     checkout = tmp_path / "my checkout"
     Distribution(name="acme").install_editable(site, checkout)
     assert editable_folder(NAME) == str(checkout)
-    assert reinstall_command(NAME) == f"pip install -e '{checkout}'"
+    assert reinstall_command(NAME) == f"Run: pip install -e '{checkout}'"
 
 
 def test_from_a_local_folder_or_file(site: Path, tmp_path: Path) -> None:
     Distribution(name="acme").write_metadata(site, source=tmp_path)
     assert editable_folder(NAME) is None
-    assert reinstall_command(NAME) == f"pip install --upgrade {tmp_path}"
+    assert reinstall_command(NAME) == f"Run: pip install --upgrade {tmp_path}"
 
 
 @pytest.mark.parametrize("text", ["", "{", "[]", '{"url": "https://example.org/acme.whl"}', '{"url": 3}'])
 def test_what_says_nothing_of_use_counts_as_an_index(site: Path, text: str) -> None:
     (Distribution(name="acme").write_metadata(site) / "direct_url.json").write_text(text)
-    assert reinstall_command(NAME) == "pip install --upgrade soma-backend-acme"
+    assert reinstall_command(NAME) == "Run: pip install --upgrade soma-backend-acme"
 
 
 def test_of_a_distribution_that_is_not_installed() -> None:
-    assert reinstall_command("soma-backend-nowhere") == "pip install --upgrade soma-backend-nowhere"
+    assert reinstall_command("soma-backend-nowhere") == "Run: pip install --upgrade soma-backend-nowhere"
     assert core_requirement("soma-backend-nowhere") == "soma-body-core"
 
 

@@ -73,6 +73,7 @@ def test_a_declaration_is_shown_with_all_that_a_user_must_know(tmp_path: Path) -
             FileNeeded(path=missing, description="the texture", url="https://example.org"),
         ),
         options=Options,
+        api=2,
         licence="CC0-1.0",
         url="https://example.org/good",
         params=(
@@ -84,7 +85,7 @@ def test_a_declaration_is_shown_with_all_that_a_user_must_know(tmp_path: Path) -
     assert _lines(registry) == [
         "backend       good",
         "distribution  soma-backend-good 1.0",
-        "plugin        soma_backend_good (api 1)",
+        "plugin        soma_backend_good (api 2)",
         "config        none: only for Python",
         "licence       CC0-1.0",
         "url           https://example.org/good",

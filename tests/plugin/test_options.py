@@ -12,7 +12,7 @@ import pytest
 from omegaconf import OmegaConf
 
 from soma_core.errors import InputError
-from soma_core.plugin.options import OptionRow, checked_options, option_rows
+from soma_core.plugin.options import OptionRow, checked_options, option_rows, options_by_name
 from tests.plugin.fakes import SOUND
 
 
@@ -67,7 +67,7 @@ SPEC = replace(SOUND, options=Options)
 
 
 def checked(**options: Any) -> dict[str, Any]:
-    return checked_options(SPEC, options)
+    return options_by_name(checked_options(SPEC, options))
 
 
 def test_defaults_are_filled_in() -> None:
@@ -179,7 +179,7 @@ class Required:
 
 def test_an_option_without_default_must_be_given() -> None:
     spec = replace(SOUND, options=Required)
-    assert checked_options(spec, {"model": "x"}) == {"model": "x"}
+    assert checked_options(spec, {"model": "x"}) == Required("x")
     with pytest.raises(InputError) as caught:
         checked_options(spec, {})
     assert str(caught.value) == (
@@ -188,7 +188,7 @@ def test_an_option_without_default_must_be_given() -> None:
 
 
 def test_a_backend_without_options_takes_none() -> None:
-    assert checked_options(SOUND, {}) == {}
+    assert checked_options(SOUND, {}) is None
     with pytest.raises(InputError) as caught:
         checked_options(SOUND, {"speed": 3})
     assert str(caught.value) == (
@@ -199,7 +199,7 @@ def test_a_backend_without_options_takes_none() -> None:
 def test_a_composed_configuration_is_taken_as_it_is() -> None:
     config = OmegaConf.create({"names": ["x"], "weights": {"a": 1}, "solver": {"steps": 3}})
     values = checked_options(SPEC, config)  # type: ignore[arg-type]
-    assert (values["names"], values["weights"], values["solver"].steps) == (["x"], {"a": 1.0}, 3)
+    assert (values.names, values.weights, values.solver.steps) == (["x"], {"a": 1.0}, 3)
 
 
 def test_options_are_listed_with_type_and_default() -> None:

@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-import contextlib
 import json
 import sys
-from dataclasses import dataclass
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from soma_core.errors import InputError
-from soma_core.plugin.errors import BackendError
 from soma_core.plugin.registry import Registry
-from soma_core.tasks import EXIT_BACKEND, EXIT_FAILED, EXIT_OK, backends
+from soma_core.tasks import EXIT_BACKEND, EXIT_FAILED, EXIT_OK, EXIT_USAGE, backends
+from soma_core.testing.report import Outcome, Report
 from soma_core.testing.synthetic import synthetic_canonical, write_wrap_pair
 from tests.plugin.fakes import FakeEntryPoint, declares, good
 from tests.plugin.installed import Distribution
@@ -30,7 +29,15 @@ def _run(*arguments: str) -> tuple[str, int]:
 def _install(monkeypatch: pytest.MonkeyPatch, *points: FakeEntryPoint) -> Registry:
     registry = Registry(points)
     monkeypatch.setattr(backends, "default_registry", lambda: registry)
+    monkeypatch.setattr(backends, "run_in_child", _run_here)
     return registry
+
+
+def _run_here(function: str, *arguments: Any, seconds: float, preload: Any = ()) -> Iterator[Any]:
+    """In place of a child process, in which there would be other registries."""
+    said: list[Any] = []
+    getattr(backends, function.partition(":")[2])(said.append, *arguments)
+    return iter(json.loads(json.dumps(said)))
 
 
 def _with_pair(folder: Path) -> FakeEntryPoint:
@@ -65,7 +72,7 @@ def test_a_clash_of_configs_is_listed_once(site: Path, monkeypatch: pytest.Monke
 
 def test_loading_shows_what_is_broken(monkeypatch: pytest.MonkeyPatch) -> None:
     registry = _install(monkeypatch, FakeEntryPoint("bad", declares("other")), good())
-    monkeypatch.setattr(backends, "load_all", _declare_all)
+    monkeypatch.setattr(backends, "load", lambda registry, name, *, begun: registry.spec(name))
     text, code = _run("--load")
     assert "bad      broken (spec)" in text
     assert code == EXIT_BACKEND
@@ -76,10 +83,27 @@ def test_loading_shows_what_is_broken(monkeypatch: pytest.MonkeyPatch) -> None:
     assert registry.names() == ("good",)
 
 
-def _declare_all(registry: Registry) -> None:
-    for name in registry.names():
-        with contextlib.suppress(BackendError):
-            registry.spec(name)
+def test_loading_with_a_conflict_is_no_success(monkeypatch: pytest.MonkeyPatch) -> None:
+    _install(monkeypatch, FakeEntryPoint("b", distribution="x"), FakeEntryPoint("b", distribution="y"))
+    assert _run("--load")[1] == EXIT_BACKEND
+    assert _run()[1] == EXIT_OK
+
+
+def test_json_is_json_where_there_is_no_result(monkeypatch: pytest.MonkeyPatch) -> None:
+    _install(monkeypatch, FakeEntryPoint("bad", declares("other")))
+    for arguments in (["show", "bad"], ["show", "nobody"], ["check", "nobody"], ["check"]):
+        text, code = _run(*arguments, "--json")
+        assert json.loads(text)["error"]["cause"]
+        assert code == (EXIT_USAGE if arguments == ["check"] else EXIT_BACKEND)
+
+
+def test_what_is_known_is_listed_with_the_licence_that_the_plugin_declares() -> None:
+    rows = {row["name"]: row for row in json.loads(_run("known", "--json")[0])}
+    registry = Registry()
+    for name in {*rows} & {*registry.names()}:
+        assert rows[name]["licence"] == registry.spec(name).licence
+        assert rows[name]["distribution"] == registry.offers(name)[0].distribution
+    assert "LICENCE OF THE MODEL" in _run("known")[0]
 
 
 def test_requirements_name_each_distribution(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -133,45 +157,34 @@ def test_what_a_plugin_prints_does_not_reach_the_result(
     assert (streams.out, streams.err) == ("", "loading weights\n")
 
 
-@dataclass
-class _Report:
-    """What a run of checks reports."""
-
-    failed: tuple[str, ...] = ()
-    missing_files: tuple[Path, ...] = ()
-
-    def text(self) -> str:
-        return "as text"
-
-    def json(self) -> str:
-        return '{"as": "json"}'
+def _report(*states: str, missing: tuple[Path, ...] = ()) -> Report:
+    document = {"level": "core", "summary": "it holds", "got": "3", "expected": "4", "seconds": 0.5}
+    outcomes = [
+        Outcome.of_document(document | {"id": f"check-{number}", "state": state})
+        for number, state in enumerate(states)
+    ]
+    return Report(
+        backend="acme", distribution="a 1", level="core", outcomes=tuple(outcomes), missing_files=missing
+    )
 
 
 @pytest.mark.parametrize(
     ("report", "code"),
     [
-        (_Report(), EXIT_OK),
-        (_Report(failed=("wrap-order",)), EXIT_FAILED),
-        (_Report(missing_files=(Path("model.npz"),)), EXIT_BACKEND),
+        (_report("passed"), EXIT_OK),
+        (_report("passed", "failed"), EXIT_FAILED),
+        (_report("passed", missing=(Path("model.npz"),)), EXIT_BACKEND),
     ],
 )
 def test_the_outcome_of_the_checks_sets_the_exit_code(
-    report: _Report, code: int, monkeypatch: pytest.MonkeyPatch
+    report: Report, code: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    asked: dict[str, Any] = {}
-
-    def check_backend(name: str, **options: Any) -> _Report:
-        asked.update(options, name=name)
-        return report
-
-    monkeypatch.setattr("soma_core.testing.check_backend", check_backend, raising=False)
-    assert _run("check", "acme") == ("as text", code)
-    assert asked == {"name": "acme", "level": "full", "only": []}
-    assert _run("check", "acme", "--level", "core", "-k", "spec", "-k", "wrap-*", "--json") == (
-        '{"as": "json"}',
-        code,
-    )
-    assert asked == {"name": "acme", "level": "core", "only": ["spec", "wrap-*"]}
+    _install(monkeypatch, good("acme"), good("bodies"))
+    monkeypatch.setattr(backends, "_checked", lambda name, options: report)
+    assert _run("check", "acme") == (report.text(), code)
+    assert _run("check", "acme", "--json") == (report.json(), code)
+    assert _run("check", "--all") == (f"{report.brief()}\n{report.brief()}", code)
+    assert json.loads(_run("check", "--all", "--json")[0]) == [report.document()] * 2
 
 
 def test_a_new_backend_is_written_and_the_next_steps_named(

@@ -15,7 +15,7 @@ from soma_core import SomaLayer, load_canonical
 from soma_core.errors import InputError
 from soma_core.obj import read_obj
 from soma_core.plugin.registry import Registry
-from soma_core.template import distribution, write_backend
+from soma_core.template import distribution, update_backend, write_backend
 from tests.plugin.fakes import FakeDistribution, FakeEntryPoint, good
 
 FILE_PRECISION = 1e-6
@@ -47,13 +47,14 @@ def test_the_folder_holds_exactly_what_an_author_needs(acme):
         "pyproject.toml",
         "README.md",
         "LICENSE",
+        ".soma-template.json",
         ".github/workflows/test.yml",
         "soma_backend_acme/__init__.py",
         "soma_backend_acme/_generator.py",
         "soma_backend_acme/configs/backend/acme.yaml",
         "soma_backend_acme/model.npz",
         "soma_backend_acme/native.obj",
-        "soma_backend_acme/wrap.obj",
+        "soma_backend_acme/SOMA_wrap.obj",
         "tests/test_acme.py",
     }
 
@@ -75,7 +76,7 @@ def test_every_file_is_of_its_kind_and_names_the_backend(tmp_path):
     config = yaml.safe_load((folder / "soma_backend_two_words/configs/backend/two_words.yaml").read_text())
     assert config == {"name": "two_words", "params": {"shape": None}, "options": {}}
     jobs = yaml.safe_load((folder / ".github/workflows/test.yml").read_text())
-    assert {"run": 'pip install "$SOMA_CORE" .[test]'} in jobs["jobs"]["test"]["steps"]
+    assert {"run": "pip install './[test]'"} in jobs["jobs"]["test"]["steps"]
     for source in folder.rglob("*.py"):
         compile(source.read_text(), source.name, "exec")
     assert 'TestTwoWords = conformance_suite("two_words")' in (folder / "tests/test_two_words.py").read_text()
@@ -91,7 +92,7 @@ def test_the_meshes_are_the_canonical_one_and_the_model_agrees(acme):
     package = acme / "soma_backend_acme"
     native, _ = read_obj(package / "native.obj")
     np.testing.assert_allclose(native, load_canonical("low")[0].vertices, atol=FILE_PRECISION, rtol=0)
-    wrap, faces = read_obj(package / "wrap.obj")
+    wrap, faces = read_obj(package / "SOMA_wrap.obj")
     np.testing.assert_allclose(wrap, load_canonical("mid")[0].vertices, atol=FILE_PRECISION, rtol=0)
     np.testing.assert_array_equal(faces, load_canonical("mid")[0].triangles)
     with np.load(package / "model.npz", allow_pickle=False) as model:
@@ -170,3 +171,26 @@ def test_a_file_in_the_way_is_named(tmp_path):
 
 def test_the_folder_above_is_made(tmp_path):
     assert write_backend("acme", tmp_path / "a/b", registry=NOBODY).parent == tmp_path / "a/b"
+
+
+def test_an_update_writes_what_the_author_left_alone(tmp_path, monkeypatch):
+    folder = write_backend("acme", tmp_path, registry=NOBODY)
+    readme, config = folder / "README.md", folder / "soma_backend_acme/configs/backend/acme.yaml"
+    config.write_text("name: acme # mine\n")
+    assert update_backend("acme", tmp_path) == ["template 2 -> 2"]
+    plain = distribution._texts
+    monkeypatch.setattr(distribution, "TEMPLATE_VERSION", 3)
+    later = {path: f"{text}# later\n" for path, text in plain("acme").items()}
+    monkeypatch.setattr(distribution, "_texts", lambda name: later)
+    told = update_backend("acme", folder)
+    assert told[-1] == "template 2 -> 3"
+    assert readme.read_text().endswith("# later\n")
+    assert config.read_text() == "name: acme # mine\n"
+    assert config.with_name("acme.yaml.new").read_text().endswith("# later\n")
+    assert any("acme.yaml is changed, merge them" in line for line in told)
+    assert update_backend("acme", folder) == ["template 3 -> 3"]
+
+
+def test_nothing_to_update_is_refused(tmp_path):
+    with pytest.raises(InputError, match=r"holds soma-backend-acme with its \.soma-template\.json"):
+        update_backend("acme", tmp_path)

@@ -5,6 +5,7 @@ A mutant is the id of the check that must fail, what its sentence must say, and 
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,6 +16,7 @@ from tests.testing.packages import Edit, Package
 __all__ = ["MUTANTS", "Mutant"]
 
 _INIT, _GENERATOR, _CONFIG = "__init__.py", "_generator.py", "configs/backend/specimen.yaml"
+_MOTION, _SHARES = "_motion.py", "(near / near.sum(1, keepdim=True))"
 _RETURN = 'return self.template + torch.einsum("bk,knc->bnc", coefficients, self.fields)'
 _BEGIN = "coefficients = self.coefficients(params)"
 _BUILD = "    return Specimen("
@@ -44,6 +46,19 @@ def _before_rest(line: str) -> Edit:
 
 def _before_build(line: str) -> Edit:
     return _in(_INIT, _BUILD, f"    {line}\n{_BUILD}")
+
+
+def _returns(method: str, value: str) -> Edit:
+    """Let a method return something else before it does anything."""
+    head = re.compile(rf"(    def {method}\(self.*\):\n        \"\"\".*\"\"\"\n)")
+
+    def edit(made: Package) -> None:
+        path = made.folder / _GENERATOR
+        text, count = head.subn(rf"\g<1>        return {value}\n", path.read_text())
+        assert count == 1
+        path.write_text(text)
+
+    return edit
 
 
 def _at_import(line: str) -> Edit:
@@ -268,11 +283,18 @@ MUTANTS = (
     ),
     Mutant("generator-shape", "batch of 1: got ndarray", _rest("v.detach().numpy()")),
     Mutant("generator-shape", "batch of 3: got", _rest("v[:1]")),
-    Mutant("generator-dtype", "dtype=torch.float64: got torch.float32", _rest("v.float()")),
+    Mutant("generator-dtype", "dtype=torch.float64, under .*: got torch.float32", _rest("v.float()")),
     Mutant(
-        "generator-device",
-        "device=(cpu|cuda:0): got (meta|cpu)",
-        _rest("v.to('cpu' if torch.cuda.is_available() else 'meta')"),
+        "generator-dtype",
+        "dtype=torch.float32, under the default dtype torch.float64: got torch.float64",
+        _rest("v + torch.zeros(3)"),
+    ),
+    Mutant("generator-device", "device=cpu: got meta", _rest("v.to('meta')")),
+    Mutant("other-device", "got tensors of two devices", _rest("v + torch.zeros(3, dtype=v.dtype)")),
+    Mutant(
+        "other-device",
+        "device=(meta|cuda.*): got cpu",
+        _rest("v if v.device.type == 'cpu' else torch.zeros(v.shape, dtype=v.dtype)"),
     ),
     Mutant(
         "finite",
@@ -324,6 +346,87 @@ MUTANTS = (
         "got a change of the environment variables",
         _before_build("import os; os.environ['SPECIMEN'] = '1'"),
     ),
+    Mutant(
+        "no-global-state",
+        "got a change of torch's gradient mode",
+        _before_build("import torch; torch.set_grad_enabled(False)"),
+    ),
+    Mutant(
+        "no-global-state",
+        "got a change of torch's gradient mode",
+        _before_rest("torch.set_grad_enabled(False)"),
+    ),
+    Mutant(
+        "no-global-state",
+        "got a change of torch's default dtype",
+        _in(_GENERATOR, "\n\nclass Specimen", "\ntorch.set_default_dtype(torch.float64)\n\nclass Specimen"),
+    ),
+    Mutant(
+        "no-global-state",
+        "got a change of the warning filters",
+        _at_import("import warnings; warnings.filterwarnings('ignore', 'specimen')"),
+    ),
+    Mutant(
+        "no-global-state",
+        "got a change of the warning filters",
+        _before_build("import warnings; warnings.simplefilter('error')"),
+    ),
+    Mutant(
+        "no-own-gradient",
+        r"rest\(\): got a tensor that requires a gradient",
+        _in(_GENERATOR, "self.template = template.to(", "self.template = torch.nn.Parameter(template).to("),
+    ),
+    Mutant(
+        "no-own-gradient",
+        r"linear_basis\(\).basis: got a tensor that requires",
+        _in(_GENERATOR, "basis=self.fields,", "basis=torch.nn.Parameter(self.fields),"),
+    ),
+    Mutant("linear-basis", "got int, expected a LinearBasis", _returns("linear_basis", "42")),
+    Mutant("triangles", "got int, expected whole numbers", _returns("triangles", "42")),
+    Mutant("triangles", "got torch.float32", _returns("triangles", "self.faces.float()")),
+    Mutant("triangles", "got ids from 1 to", _returns("triangles", "self.faces + 1")),
+    Mutant("triangles", "got faces that look inward", _returns("triangles", "self.faces.flip(1)")),
+    Mutant("skinning", "skinning returned int, expected a SkinnedModel", _returns("skinning", "42")),
+    Mutant("skinning", "weights of skinning are .* sums 1.1", _in(_GENERATOR, _SHARES, f"1.1 * {_SHARES}")),
+    Mutant("skinning", "parents of skinning is", _in(_GENERATOR, "(-1, 0, 1)", "(-1, 2, 0)")),
+    Mutant("skinning", "joint_names of skinning", _in(_GENERATOR, '"chest", "head"', '"head", "head"')),
+    Mutant(
+        "skinning", "joints of skinning is a tensor", _in(_GENERATOR, "joints=joints,", "joints=joints[0],")
+    ),
+    Mutant(
+        "skinning", r"skinning\(\).rest, native vertex", _in(_GENERATOR, "rest=rest,", "rest=1.01 * rest,")
+    ),
+    Mutant(
+        "skinning", "hips far outside the body", _in(_GENERATOR, "joints=joints,", "joints=joints + 400,")
+    ),
+    Mutant("posed", "got int, expected a tensor", _returns("posed", "42")),
+    Mutant("posed", r"posed\(\) with every joint turned", _in(_GENERATOR, "total + shift[:, None]", "total")),
+    Mutant("posed", r"posed\(\) with every", _in(_GENERATOR, "_matrix(turns)", "_matrix(turns.deg2rad())")),
+    Mutant("posed", "numbers that are not finite", _in(_GENERATOR, "total + shift", "total / 0 + shift")),
+    Mutant(
+        "random-poses", "other poses for the same", _in(_GENERATOR, ".manual_seed(seed)", "; random.seed()")
+    ),
+    Mutant("random-poses", "one pose for all seeds", _in(_GENERATOR, "manual_seed(seed)", "manual_seed(7)")),
+    Mutant(
+        "random-poses",
+        "a change of torch's random state",
+        _in(_GENERATOR, "random = torch.Generator().manual_seed(seed)", "random = torch.manual_seed(seed)"),
+    ),
+    Mutant("pose-vector", "heading: got another motion", _in(_GENERATOR, "= 6, 6, 5", "= 6, 6, 3")),
+    Mutant("pose-vector", "got .6, 3, 5.", _in(_GENERATOR, "= 6, 6, 5", "= 6, 3, 5")),
+    Mutant("pose-vector", r"own_arrays\(\)\['turn'\]: got \(3,\)", _in(_GENERATOR, "[:, 3:]}", "[0, 3:]}")),
+    Mutant("expressions", "expressions returned int", _returns("expressions", "42")),
+    Mutant("expressions", "names of expressions", _in(_GENERATOR, '("smile",)', '("smile", "smile")')),
+    Mutant("expressions", "the basis of expressions is", _in(_GENERATOR, "self.smile[None]", "self.smile")),
+    Mutant("motion-formats", "fps of .* from read", _in(_MOTION, 'float(arrays["fps"])', "30.0")),
+    Mutant(
+        "motion-formats",
+        "rotations of .* from read",
+        _in(_MOTION, '"rotations": arrays["specimen_turns"]', '"rotations": 57 * arrays["specimen_turns"]'),
+    ),
+    Mutant("motion-formats", "got dict from read", _in(_MOTION, "return ModelMotion(", "return dict(")),
+    Mutant("own-checks", "soma_motions gave 'x'", _in(_INIT, "return [FORMAT]", 'return ["x"]')),
+    Mutant("own-checks", "suffixes of the motion format", _in(_MOTION, '(".npz",)', '("npz",)')),
     Mutant(
         "parameters",
         r"parameter shape\[3\]: got the default body over",

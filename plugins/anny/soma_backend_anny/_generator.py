@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from soma_backend_anny import _basis
+from soma_backend_anny._options import AnnyOptions
 from soma_backend_anny._phenotypes import macro_weights
 from soma_core import InputError
 from soma_core.plugin import BackendSpec, LinearBasis
@@ -33,13 +33,13 @@ class AnnyGenerator:
     """
 
     def __init__(
-        self, spec: BackendSpec, *, device: torch.device, dtype: torch.dtype, options: Mapping[str, Any]
+        self, spec: BackendSpec, *, device: torch.device, dtype: torch.dtype, options: AnnyOptions
     ) -> None:
-        self._phenotypes = _phenotype_set(options.get("phenotypes", "all"))
+        self._phenotypes = _phenotype_set(options.phenotypes)
         declared = [parameter.name for parameter in spec.params if parameter.group == "local_changes"]
-        self._local_changes = _enabled_local_changes(options.get("local_changes", "none"), declared)
+        self._local_changes = _enabled_local_changes(options.local_changes, declared)
         stored = _basis.load_phenotype_basis(self._phenotypes)
-        rank = int((stored.remaining_mm > float(options.get("tolerance_mm", 1e-5))).sum())
+        rank = int((stored.remaining_mm > float(options.tolerance_mm)).sum())
         rows = [stored.basis[:rank]]
         if self._local_changes:
             rows.append(_basis.load_local_changes(self._local_changes))

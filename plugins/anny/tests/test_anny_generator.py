@@ -28,7 +28,7 @@ LOCAL = ("nose-scale-vert-incr", "stomach-tone-incr")
 
 
 def build(dtype=torch.float64, **options):
-    return soma_backend_anny.soma_generator(SPEC, CPU, dtype, options)
+    return soma_backend_anny.soma_generator(SPEC, CPU, dtype, soma_backend_anny.AnnyOptions(**options))
 
 
 @pytest.fixture(scope="module")

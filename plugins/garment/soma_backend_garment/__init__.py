@@ -49,6 +49,7 @@ def soma_backend() -> BackendSpec:
     native, wrap = pair / "mean.obj", pair / "SOMA_wrap.obj"
     return BackendSpec(
         name="garment",
+        api=2,
         unit="m",
         up="+y",
         forward="+z",

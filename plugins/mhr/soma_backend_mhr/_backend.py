@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from soma_backend_mhr._files import IDENTITY, Lod
 from soma_core.plugin import BackendSpec, FileNeeded, Generator, Parameter
@@ -35,6 +34,7 @@ def declare(lod: Lod) -> BackendSpec:
     command = f"soma wrap backend={lod.name} out={pair.wrap.parent}"
     return BackendSpec(
         name=lod.name,
+        api=2,
         unit="cm",
         up="+y",
         forward="+z",
@@ -71,10 +71,10 @@ def declare(lod: Lod) -> BackendSpec:
     )
 
 
-def build(lod: Lod, device: torch.device, dtype: torch.dtype, options: Mapping[str, Any]) -> Generator:
+def build(lod: Lod, device: torch.device, dtype: torch.dtype, options: MhrOptions) -> Generator:
     """Load the user's file, after its hash was checked."""
     from soma_backend_mhr._generator import MhrGenerator
     from soma_backend_mhr._model_file import load_model
 
-    model = load_model(lod.model(), lod, device=device, dtype=dtype, trust=options["trust"])
+    model = load_model(lod.model(), lod, device=device, dtype=dtype, trust=options.trust)
     return MhrGenerator(model, device)

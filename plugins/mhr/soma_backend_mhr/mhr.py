@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
-from soma_backend_mhr._backend import build, declare
+from soma_backend_mhr._backend import MhrOptions, build, declare
 from soma_backend_mhr._files import LOD1
 from soma_core.plugin import BackendSpec, Generator, hookimpl
 
@@ -22,6 +21,6 @@ def soma_backend() -> BackendSpec:
 
 
 @hookimpl
-def soma_generator(device: torch.device, dtype: torch.dtype, options: Mapping[str, Any]) -> Generator:
+def soma_generator(device: torch.device, dtype: torch.dtype, options: MhrOptions) -> Generator:
     """Build MHR at LOD 1 from the user's file."""
     return build(LOD1, device, dtype, options)

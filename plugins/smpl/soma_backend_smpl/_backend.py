@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
@@ -63,6 +62,7 @@ def declare(family: Family) -> BackendSpec:
     source = str(model) if model.exists() else "FILE"
     return BackendSpec(
         name=family.name,
+        api=2,
         unit="m",
         up="+y",
         forward="+z",
@@ -101,7 +101,7 @@ def declare(family: Family) -> BackendSpec:
 
 
 def build(
-    family: Family, spec: BackendSpec, device: torch.device, dtype: torch.dtype, options: Mapping[str, Any]
+    family: Family, spec: BackendSpec, device: torch.device, dtype: torch.dtype, options: SmplOptions
 ) -> Generator:
     """Read the model of the gender asked for.
 
@@ -111,7 +111,7 @@ def build(
     from soma_backend_smpl._generator import SmplGenerator
 
     found = find_models(family)
-    gender = options["gender"]
+    gender = options.gender
     if gender not in found:
         others = f"; there are {', '.join(found)}" if found else ""
         raise AssetError(
@@ -125,7 +125,7 @@ def build(
         device,
         dtype,
         parameter_count=count,
-        components=options["components"],
+        components=options.components,
     )
 
 

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
-from soma_backend_smpl._backend import build, convert, declare
+from soma_backend_smpl._backend import SmplOptions, build, convert, declare
 from soma_backend_smpl.family import SMPL
 from soma_core.plugin import BackendSpec, Generator, hookimpl
 
@@ -24,7 +24,7 @@ def soma_backend() -> BackendSpec:
 
 @hookimpl
 def soma_generator(
-    spec: BackendSpec, device: torch.device, dtype: torch.dtype, options: Mapping[str, Any]
+    spec: BackendSpec, device: torch.device, dtype: torch.dtype, options: SmplOptions
 ) -> Generator:
     """Build SMPL from the user's file."""
     return build(SMPL, spec, device, dtype, options)

@@ -1,7 +1,7 @@
 """A body of capsules for SOMA Core: no data, few lines, every part of a backend. Read it to write your own.
 
 ``_figure`` is the shape, ``_generator`` the model, ``configs/backend/toy.yaml`` what the command line may
-set, ``native.obj`` and ``wrap.obj`` tie the shape to the canonical mesh. Listing backends imports this
+set, ``native.obj`` and ``SOMA_wrap.obj`` tie the shape to the canonical mesh. Listing backends imports this
 module, so it stays light: torch comes in with the generator.
 """
 
@@ -29,6 +29,7 @@ def soma_backend() -> BackendSpec:
     """Declare the toy: centimetres, +Z up, facing -Y; it has no mouth and no eyes."""
     return BackendSpec(
         name="toy",
+        api=2,
         unit="cm",
         up="+z",
         forward="-y",
@@ -40,7 +41,7 @@ def soma_backend() -> BackendSpec:
             _factor("shoulders", 0.85, 1.2, "factor of the width of the shoulders"),
             _factor("head", 0.8, 1.3, "factor of the size of the head"),
         ),
-        wrap=WrapPair(native=_FOLDER / "native.obj", wrap=_FOLDER / "wrap.obj"),
+        wrap=WrapPair(native=_FOLDER / "native.obj", wrap=_FOLDER / "SOMA_wrap.obj"),
         fill_segments=("mouth_bag", "eye_bags"),
         licence="Apache-2.0",
         description="a figure of capsules, made of formulas",

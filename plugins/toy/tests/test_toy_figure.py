@@ -93,7 +93,7 @@ def test_the_wrap_pair_is_what_the_script_writes(tmp_path):
     script["main"]()
     for made, shipped in (
         (tmp_path / "native.obj", SPEC.wrap.native),
-        (tmp_path / "wrap.obj", SPEC.wrap.wrap),
+        (tmp_path / "SOMA_wrap.obj", SPEC.wrap.wrap),
     ):
         for ours, theirs in zip(read_obj(made), read_obj(shipped), strict=True):
             np.testing.assert_allclose(ours, theirs, atol=10 * FILE_PRECISION, rtol=0)

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import torch
 
 from soma_core.plugin.checks import CheckFailedError, check
-from soma_core.plugin.spec import HasLinearBasis
+from soma_core.plugin.spec import HasLinearBasis, LinearBasis
 from soma_core.testing.context import Context
 
 __all__ = ["CHECKS"]
@@ -22,7 +24,13 @@ def _no_pair(context: Context) -> str:
     return "there is no wrap pair" if context.spec.wrap is None else ""
 
 
-@check("neutral-equals-obj", level="core", needs=("deterministic",), unless=_no_pair)
+@check(
+    "neutral-equals-obj",
+    mend="write `native.obj` from the default body",
+    level="core",
+    needs=("deterministic",),
+    unless=_no_pair,
+)
 def neutral_equals_obj(context: Context) -> None:
     """The default body is the native OBJ, up to where it stands."""
     with torch.no_grad():
@@ -46,13 +54,24 @@ def _not_linear(context: Context) -> str:
     return "" if isinstance(context.generator, HasLinearBasis) else "the generator offers no linear basis"
 
 
-@check("linear-basis", level="core", needs=("batch-invariant", "inputs-unchanged"), unless=_not_linear)
+@check(
+    "linear-basis",
+    mend="`template + coefficients @ basis` must be `rest()`",
+    level="core",
+    needs=("batch-invariant", "inputs-unchanged"),
+    unless=_not_linear,
+)
 def linear_basis(context: Context) -> None:
     """The linear basis gives the same bodies as the generator."""
     params = context.random_params() or context.default_params()
     assert isinstance(context.generator, HasLinearBasis)
     with torch.no_grad():
-        linear = context.generator.linear_basis()
+        linear: Any = context.generator.linear_basis()
+        if not isinstance(linear, LinearBasis):
+            raise CheckFailedError(
+                "linear_basis()", got=type(linear).__name__, expected="a LinearBasis",
+                fix="Return soma_core.plugin.LinearBasis.",
+            )  # fmt: skip
         found = linear.template + torch.einsum("bk,knc->bnc", linear.coefficients(params), linear.basis)
         distance = context.metres * (found - context.generator.rest(params)).norm(dim=-1)
     if not distance.max() <= _LINEAR_M:

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from soma_core.plugin.checks import CheckFailedError, check
-from soma_core.plugin.spec import Generator
+from soma_core.plugin.spec import Generator, HasLinearBasis
 from soma_core.testing.context import Context
 from soma_core.testing.global_state import changes, snapshot
 
@@ -39,7 +40,12 @@ def _no_parameters(context: Context) -> str:
     return "" if context.parameters else "the backend has no parameters"
 
 
-@check("deterministic", level="core", needs=("finite",))
+@check(
+    "deterministic",
+    mend="keep no state between calls, draw nothing at random",
+    level="core",
+    needs=("finite",),
+)
 def deterministic(context: Context) -> None:
     """Equal parameters give equal bodies, whatever was generated before."""
     first, other = (context.random_params(2, seed=seed) or context.default_params() for seed in (1, 2))
@@ -52,7 +58,13 @@ def deterministic(context: Context) -> None:
     _compare(context, _rest(context.new_generator(), other), second, "rest() of a new generator", fix)
 
 
-@check("batch-invariant", level="core", needs=("deterministic",), unless=_no_parameters)
+@check(
+    "batch-invariant",
+    mend="compute each row for itself",
+    level="core",
+    needs=("deterministic",),
+    unless=_no_parameters,
+)
 def batch_invariant(context: Context) -> None:
     """Each body of a batch is the one it would be alone."""
     params = context.random_params()
@@ -63,7 +75,13 @@ def batch_invariant(context: Context) -> None:
         _compare(context, bodies[row : row + 1], alone, f"random body {row} in a batch of {len(bodies)}", fix)
 
 
-@check("inputs-unchanged", level="core", needs=("generator-device",), unless=_no_parameters)
+@check(
+    "inputs-unchanged",
+    mend="do not write in place",
+    level="core",
+    needs=("generator-device",),
+    unless=_no_parameters,
+)
 def inputs_unchanged(context: Context) -> None:
     """The generator leaves the tensors that it is given as they are."""
     params = context.random_params()
@@ -80,20 +98,45 @@ def inputs_unchanged(context: Context) -> None:
             )
 
 
-@check("no-global-state", needs=("generator-device",))
+@check(
+    "no-global-state", mend="pass dtype, device, generator; set nothing global", needs=("generator-device",)
+)
 def no_global_state(context: Context) -> None:
-    """Building and generating leave what is global in the process alone."""
-    before = snapshot()
-    with torch.no_grad():
+    """Importing, building and generating leave what is global in the process alone."""
+    with torch.enable_grad():
+        before = snapshot()
         context.new_generator().rest(context.default_params())
-    changed = changes(before)
+        changed = [*context.import_probe.changed, *(context.first_changes or ()), *changes(before)]
     if changed:
         raise CheckFailedError(
-            "the process after building and generating",
-            got=f"a change of {', '.join(changed)}",
+            "the process after importing, building and generating",
+            got=f"a change of {', '.join(dict.fromkeys(changed))}",
             expected="everything as before: other backends share the process",
             fix="Pass dtype, device and a torch.Generator of your own instead of setting what is global.",
         )
 
 
-CHECKS = (deterministic, batch_invariant, inputs_unchanged, no_global_state)
+@check(
+    "no-own-gradient",
+    level="core",
+    needs=("generator-device",),
+    mend="keep constants as plain tensors, not as `nn.Parameter`",
+)
+def no_own_gradient(context: Context) -> None:
+    """Bodies carry a gradient of the parameters given, and of nothing that the model keeps."""
+    with torch.enable_grad():
+        found: dict[str, Any] = {"rest()": context.generator.rest(context.default_params())}
+        if isinstance(context.generator, HasLinearBasis):
+            linear = context.generator.linear_basis()
+            found |= {f"linear_basis().{key}": getattr(linear, key, None) for key in ("template", "basis")}
+    for where, value in found.items():
+        if getattr(value, "requires_grad", False):
+            raise CheckFailedError(
+                where,
+                got="a tensor that requires a gradient, though no parameter given does",
+                expected="constants: an optimiser would train them, and every body keeps their graph",
+                fix="Keep them as plain tensors or buffers, or call requires_grad_(False).",
+            )
+
+
+CHECKS = (deterministic, batch_invariant, inputs_unchanged, no_global_state, no_own_gradient)

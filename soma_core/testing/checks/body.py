@@ -21,6 +21,7 @@ _STATURE_M = (0.25, 3.0)
 
 @check(
     "upright",
+    mend="declare the axes that the message names",
     level="core",
     needs=(
         "neutral-equals-obj",
@@ -67,7 +68,7 @@ def _fitting_axes(rotation: np.ndarray) -> tuple[Axis, Axis]:
     return max(pairs, key=lambda pair: axes[pair[0]] @ rotation[1] + axes[pair[1]] @ rotation[2])
 
 
-@check("stature", level="core", needs=("upright",))
+@check("stature", mend="correct `unit`, or the ranges", level="core", needs=("upright",))
 def stature(context: Context) -> None:
     """The default body and random ones are of human size."""
     for row, body in enumerate(context.bodies.identity.fitted_rest.numpy()):

@@ -10,13 +10,13 @@ from soma_core.topology.transfer import filled_vertices
 __all__ = ["CHECKS"]
 
 
-@check("declares", level="core")
+@check("declares", mend="see the stages `import`, `hooks` and `spec` below", level="core")
 def declares(context: Context) -> None:
     """The plugin imports, implements the hooks and declares a backend."""
     context.registry.spec(context.name)
 
 
-@check("licence", level="core", needs=("declares",))
+@check("licence", mend='state `licence="..."`', level="core", needs=("declares",))
 def licence(context: Context) -> None:
     """The declaration states the licence of the model."""
     if not context.spec.licence.strip():
@@ -28,7 +28,12 @@ def licence(context: Context) -> None:
         )
 
 
-@check("described", level="core", needs=("declares",))
+@check(
+    "described",
+    mend="say what it changes, and what the ends of its range mean",
+    level="core",
+    needs=("declares",),
+)
 def described(context: Context) -> None:
     """The backend and each parameter are described in one line."""
     texts = {"BackendSpec.description": context.spec.description}
@@ -43,7 +48,12 @@ def described(context: Context) -> None:
             )
 
 
-@check("parameter-defaults", level="core", needs=("declares",))
+@check(
+    "parameter-defaults",
+    mend="correct default or range; values outside the range are allowed, but not sampled",
+    level="core",
+    needs=("declares",),
+)
 def parameter_defaults(context: Context) -> None:
     """Every parameter has its default inside its range."""
     for item in context.spec.params:
@@ -61,13 +71,19 @@ def _no_options(context: Context) -> str:
     return "" if context.spec.options else "the backend has no options"
 
 
-@check("options", level="core", needs=("declares",), unless=_no_options)
+@check(
+    "options",
+    mend="give the fields of the dataclass defaults",
+    level="core",
+    needs=("declares",),
+    unless=_no_options,
+)
 def options(context: Context) -> None:
     """Every option has a default: the backend works by its name alone."""
     checked_options(context.spec, {})
 
 
-@check("fill-segments", level="core", needs=("declares",))
+@check("fill-segments", mend="`mouth_bag`, `eye_bags`", level="core", needs=("declares",))
 def fill_segments(context: Context) -> None:
     """The segments to fill exist on the canonical mesh."""
     filled_vertices(context.spec, context.mesh)
@@ -77,7 +93,13 @@ def _no_files(context: Context) -> str:
     return "" if context.spec.files else "the backend needs no files of the user"
 
 
-@check("files-named", level="core", needs=("declares",), unless=_no_files)
+@check(
+    "files-named",
+    mend="add `description`, and `url` or `command`",
+    level="core",
+    needs=("declares",),
+    unless=_no_files,
+)
 def files_named(context: Context) -> None:
     """Each file that the user must supply has a path and a source."""
     for needed in context.spec.files:
@@ -96,10 +118,11 @@ def files_named(context: Context) -> None:
             )
 
 
-@check("own-checks", level="core", needs=("declares",))
+@check("own-checks", mend="return a list of `Check`, ids once each", level="core", needs=("declares",))
 def own_checks(context: Context) -> None:
-    """The hook soma_checks, where there is one, gives sound checks."""
+    """The hooks soma_checks and soma_motions, where they are, give sound checks and motion formats."""
     context.registry.checks(context.name)
+    context.registry.formats(context.name)
 
 
 CHECKS = (

@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import itertools
+import re
+
 import torch
 
-from soma_core.plugin.checks import CheckFailedError, check
+from soma_core.errors import InputError
+from soma_core.plugin.checks import CheckFailedError, CheckNotRunError, check
 from soma_core.testing.context import CPU, Context
 from soma_core.testing.samples import at_range_ends
 
@@ -15,6 +19,7 @@ _BATCH = 3
 
 @check(
     "generator-builds",
+    mend="the cause is in the message",
     level="core",
     needs=("declares", "options", "wrap-reads", "wrap-count", "parameter-defaults"),
 )
@@ -24,7 +29,12 @@ def generator_builds(context: Context) -> None:
         context.generator.rest(context.default_params())
 
 
-@check("generator-shape", level="core", needs=("generator-builds",))
+@check(
+    "generator-shape",
+    mend="return all vertices, in the order of the file, for each row",
+    level="core",
+    needs=("generator-builds",),
+)
 def generator_shape(context: Context) -> None:
     """The generator returns as many vertices as the native OBJ has, (batch, n, 3)."""
     for count in (1, _BATCH) if context.default_params() else (1,):
@@ -41,45 +51,81 @@ def generator_shape(context: Context) -> None:
             )
 
 
-@check("generator-dtype", level="core", needs=("generator-shape",))
+@check(
+    "generator-dtype", mend="make constants with the dtype given", level="core", needs=("generator-shape",)
+)
 def generator_dtype(context: Context) -> None:
     """The generator computes in the dtype that it was built for."""
-    asked = (torch.float32, torch.float64)
-    generators = [context.new_generator(dtype=dtype) for dtype in asked]
-    for dtype, generator in zip(asked, generators, strict=True):
+    for dtype, default in itertools.product((torch.float32, torch.float64), repeat=2):
+        torch.set_default_dtype(default)  # the user's, whatever it is; put back after each check
         with torch.no_grad():
-            found = generator.rest(context.default_params(dtype=dtype)).dtype
+            found = context.new_generator(dtype=dtype).rest(context.default_params(dtype=dtype)).dtype
         if found != dtype:
             raise CheckFailedError(
-                f"rest() of a generator built with dtype={dtype}",
+                f"rest() of a generator built with dtype={dtype}, under the default dtype {default}",
                 got=found,
                 expected=dtype,
                 fix="Make every constant with the dtype that soma_generator is given.",
             )
 
 
-def _devices() -> list[torch.device]:
-    return [CPU, *([torch.device("cuda", torch.cuda.current_device())] if torch.cuda.is_available() else [])]
-
-
-@check("generator-device", level="core", needs=("generator-dtype",))
+@check(
+    "generator-device", level="core", needs=("generator-dtype",), mend="make constants on the device given"
+)
 def generator_device(context: Context) -> None:
-    """The generator computes on the device that it was built for, CPU or GPU."""
-    for device in _devices():
-        generator = context.new_generator(device=device)
-        params = {name: value.to(device) for name, value in context.default_params().items()}
-        with torch.no_grad():
-            found = generator.rest(params).device
-        if found != device:
-            raise CheckFailedError(
-                f"rest() of a generator built with device={device}",
-                got=found,
-                expected=device,
-                fix="Make every constant on the device that soma_generator is given.",
-            )
+    """The generator computes on the CPU where it was built for it."""
+    _compare_device(context, CPU)
 
 
-@check("finite", level="core", needs=("generator-device",))
+def _compare_device(context: Context, device: torch.device) -> None:
+    generator = context.new_generator(device=device)
+    params = {name: value.to(device) for name, value in context.default_params().items()}
+    with torch.no_grad():
+        found = generator.rest(params).device
+    if found != device:
+        raise CheckFailedError(
+            f"rest() of a generator built with device={device}",
+            got=found,
+            expected=device,
+            fix="Make every constant on the device that soma_generator is given.",
+        )
+
+
+_OF_TWO_DEVICES = re.compile(
+    r"two devices|same device|expected (on )?(device )?meta|not on the expected device"
+)
+
+
+@check("other-device", level="core", needs=("generator-device",), mend="make constants on the device given")
+def other_device(context: Context) -> None:
+    """The generator computes on another device than the CPU: a GPU, or torch's meta device without one."""
+    if torch.cuda.is_available():
+        _compare_device(context, torch.device("cuda", torch.cuda.current_device()))
+        return
+    try:
+        _compare_device(context, torch.device("meta"))
+    except (CheckFailedError, InputError):
+        raise
+    except Exception as error:
+        told = " ".join(str(error).split())
+        if not _OF_TWO_DEVICES.search(told):
+            raise CheckNotRunError(
+                f"no GPU is here, and torch's meta device, which stands in, cannot run this: {told:.150}"
+            ) from error
+        raise CheckFailedError(
+            "rest() of a generator built for another device than the CPU",
+            got=f"tensors of two devices ({told:.150})",
+            expected="all of them on the device given",
+            fix="Make every constant on the device that soma_generator is given.",
+        ) from error
+
+
+@check(
+    "finite",
+    mend="narrow the range, or guard the division, root or logarithm",
+    level="core",
+    needs=("generator-device",),
+)
 def finite(context: Context) -> None:
     """Bodies are finite over the declared ranges, their ends included."""
     with torch.no_grad():
@@ -98,4 +144,4 @@ def finite(context: Context) -> None:
             )
 
 
-CHECKS = (generator_builds, generator_shape, generator_dtype, generator_device, finite)
+CHECKS = (generator_builds, generator_shape, generator_dtype, generator_device, other_device, finite)

@@ -12,7 +12,7 @@ from soma_core.config.schema import register_schemas
 from soma_core.paths import configs_dir
 from soma_core.plugin.checks import CheckFailedError, check
 from soma_core.plugin.discovery import CORE_PACKAGE
-from soma_core.plugin.options import checked_options
+from soma_core.plugin.options import checked_options, options_by_name
 from soma_core.testing.context import Context
 
 __all__ = ["CHECKS"]
@@ -21,7 +21,12 @@ _HEAVY = ("torch", "warp", "pxr", "trimesh", "jax", "tensorflow")
 """Packages that take a second or more to import; listing and `soma --help` must not pay for them."""
 
 
-@check("import-light", level="core", needs=("declares",))
+@check(
+    "import-light",
+    mend="import them inside `soma_generator`, or under `if TYPE_CHECKING:`",
+    level="core",
+    needs=("declares",),
+)
 def import_light(context: Context) -> None:
     """Importing and declaring loads no heavy library."""
     probe = context.import_probe
@@ -35,7 +40,7 @@ def import_light(context: Context) -> None:
         )
 
 
-@check("import-silent", level="core", needs=("declares",))
+@check("import-silent", mend="take out `print`; use `logging`", level="core", needs=("declares",))
 def import_silent(context: Context) -> None:
     """Importing and declaring writes nothing and warns of nothing."""
     output = context.import_probe.output
@@ -66,7 +71,9 @@ def _composed(context: Context) -> DictConfig:
         return compose("animate", overrides=overrides).backend
 
 
-@check("config-composes", level="core", needs=("declares",))
+@check(
+    "config-composes", mend="add the file; its `name:` is the backend's", level="core", needs=("declares",)
+)
 def config_composes(context: Context) -> None:
     """The package ships configs/backend/<name>.yaml, and hydra composes it."""
     where = f"configs/backend/{context.name}.yaml"
@@ -85,12 +92,17 @@ def config_composes(context: Context) -> None:
         )
 
 
-@check("config-complete", level="core", needs=("config-composes", "options", "parameter-defaults"))
+@check(
+    "config-complete",
+    mend="list them; `null` is the default",
+    level="core",
+    needs=("config-composes", "options", "parameter-defaults"),
+)
 def config_complete(context: Context) -> None:
     """The config lists every parameter and option, with the defaults of Python."""
     config = OmegaConf.to_container(_composed(context))
     assert isinstance(config, dict)
-    options = checked_options(context.spec, {})
+    options = options_by_name(checked_options(context.spec, {}))
     _compare(context, "params", config["params"], {item.name: item.default for item in context.spec.params})
     _compare(context, "options", config["options"], options)
 

@@ -39,7 +39,7 @@ def _no_parameters(context: Context) -> str:
     return "" if context.parameters else "the backend has no parameters"
 
 
-@check("parameters", needs=("batch-invariant",), unless=_no_parameters)
+@check("parameters", mend="use it, or take it out", needs=("batch-invariant",), unless=_no_parameters)
 def parameters(context: Context) -> None:
     """Every entry of every parameter changes the body."""
     with torch.no_grad():
@@ -65,7 +65,13 @@ def _no_groups(context: Context) -> str:
     return "" if grouped else "no parameter that the generator takes has a group"
 
 
-@check("group-defaults", level="core", needs=("deterministic",), unless=_no_groups)
+@check(
+    "group-defaults",
+    mend="`params.get(name)` with the declared default",
+    level="core",
+    needs=("deterministic",),
+    unless=_no_groups,
+)
 def group_defaults(context: Context) -> None:
     """A parameter of a group that is left out counts as its default."""
     with torch.no_grad():
@@ -92,7 +98,12 @@ def _kept(context: Context) -> list[Change]:
     return [Change(item, (0,) * len(item.shape), item.default) for item in grouped]
 
 
-@check("gradient", needs=("batch-invariant", "inputs-unchanged"), unless=_no_parameters)
+@check(
+    "gradient",
+    mend="stay in torch; no `detach`, `.data`, NumPy",
+    needs=("batch-invariant", "inputs-unchanged", "no-global-state"),
+    unless=_no_parameters,
+)
 def gradient(context: Context) -> None:
     """Bodies are differentiable in every parameter."""
     start = near_defaults(context.parameters, dtype=torch.float64)

@@ -59,7 +59,7 @@ def _winding(points: np.ndarray, vertices: np.ndarray, triangles: np.ndarray) ->
     return total
 
 
-@check("joints-inside", needs=("transfer-random",))
+@check("joints-inside", mend="look at the wrap around that joint", needs=("transfer-random",))
 def joints_inside(context: Context) -> None:
     """Joints that lie inside the canonical body lie inside every body."""
     mesh, rig = context.mesh, context.rig
@@ -104,7 +104,7 @@ def _prepared_worlds(context: Context) -> list[tuple[str, Tensor]]:
     return found
 
 
-@check("rotations-so3", needs=("transfer-random",))
+@check("rotations-so3", mend="narrow the range", needs=("transfer-random",))
 def rotations_so3(context: Context) -> None:
     """Fitted joint rotations are rotations, also at the ends of the ranges."""
     for label, world in _prepared_worlds(context):
@@ -120,7 +120,7 @@ def rotations_so3(context: Context) -> None:
             )
 
 
-@check("zero-is-t-pose", level="core", needs=("transfer-random",))
+@check("zero-is-t-pose", mend="look at the wrap around both joints", level="core", needs=("transfer-random",))
 def zero_is_t_pose(context: Context) -> None:
     """Zero rotations give the T-pose: every bone points as on the canonical rig."""
     rig, bodies = context.rig, context.bodies
@@ -154,7 +154,7 @@ def _with_canonical(context: Context) -> Identity:
     return Identity(rest=rest, bind_world=bind, fitted_rest=rest, fitted_world=bind)
 
 
-@check("inversion-round-trip", needs=("transfer-random",))
+@check("inversion-round-trip", mend="look at the wrap around that limb", needs=("transfer-random",))
 def inversion_round_trip(context: Context) -> None:
     """Rotations that posed a body are recovered from its vertices."""
     identity, rig = _with_canonical(context), context.rig

@@ -32,7 +32,12 @@ def _no_wrap(context: Context) -> str:
     return "the native topology is the canonical one" if context.spec.wrap is None else ""
 
 
-@check("transfer-neutral", needs=("stature",), unless=_no_wrap)
+@check(
+    "transfer-neutral",
+    mend="register the missing part, or leave its faces out of `native.obj`",
+    needs=("stature",),
+    unless=_no_wrap,
+)
 def transfer_neutral(context: Context) -> None:
     """The transferred default body is the wrap."""
     body = context.bodies.identity.fitted_rest[0].numpy()
@@ -50,7 +55,12 @@ def transfer_neutral(context: Context) -> None:
         )
 
 
-@check("transfer-random", level="core", needs=("stature",))
+@check(
+    "transfer-random",
+    mend="one vertex order whatever the parameters; ranges of human bodies",
+    level="core",
+    needs=("stature",),
+)
 def transfer_random(context: Context) -> None:
     """Random bodies keep the neighbourhoods of the default body."""
     start, end = context.mesh.edges().T
@@ -69,7 +79,9 @@ def transfer_random(context: Context) -> None:
             )
 
 
-@check("similarity-equivariant", needs=("transfer-neutral", "transfer-random"))
+@check(
+    "similarity-equivariant", mend="clean faces without area", needs=("transfer-neutral", "transfer-random")
+)
 def similarity_equivariant(context: Context) -> None:
     """Turning, scaling and moving the native body does the same to the canonical one."""
     transfer: Any = copy.deepcopy(context.layer.rest_shape.transfer).float()

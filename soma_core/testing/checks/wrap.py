@@ -32,19 +32,31 @@ def _no_wrap(context: Context) -> str:
     return "the native topology is the canonical one" if context.spec.wrap is None else ""
 
 
-@check("wrap-reads", level="core", needs=("declares",), unless=_no_wrap)
+@check("wrap-reads", mend="export them again", level="core", needs=("declares",), unless=_no_wrap)
 def wrap_reads(context: Context) -> None:
     """Both files of the wrap pair are there and hold a mesh."""
     _ = context.wrap
 
 
-@check("wrap-count", level="core", needs=("wrap-reads",), unless=_no_wrap)
+@check(
+    "wrap-count",
+    mend="export without merging or splitting",
+    level="core",
+    needs=("wrap-reads",),
+    unless=_no_wrap,
+)
 def wrap_count(context: Context) -> None:
     """The wrap has one vertex for each canonical vertex."""
     check_count(context.wrap.vertices, context.mesh, path=context.wrap.path)
 
 
-@check("wrap-order", level="core", needs=("wrap-count",), unless=_no_wrap)
+@check(
+    "wrap-order",
+    mend="export with the vertex order kept",
+    level="core",
+    needs=("wrap-count",),
+    unless=_no_wrap,
+)
 def wrap_order(context: Context) -> None:
     """The wrap's vertices are in canonical order."""
     check_order(context.wrap.vertices, context.mesh, path=context.wrap.path)
@@ -69,13 +81,19 @@ def _relative_reach(points: np.ndarray, edges: np.ndarray) -> np.ndarray:
     return np.bincount(both, np.tile(length, 2), len(points)) / np.bincount(both, minlength=len(points))
 
 
-@check("wrap-faces", level="core", needs=("wrap-order",), unless=_no_wrap)
+@check("wrap-faces", mend="the same", level="core", needs=("wrap-order",), unless=_no_wrap)
 def wrap_faces(context: Context) -> None:
     """The wrap's faces are those of the canonical mesh."""
     check_faces(context.wrap.triangles, context.mesh, path=context.wrap.path)
 
 
-@check("wrap-distance", level="core", needs=("wrap-faces", "fill-segments"), unless=_no_wrap)
+@check(
+    "wrap-distance",
+    mend="register again; name what the model lacks in `fill_segments`",
+    level="core",
+    needs=("wrap-faces", "fill-segments"),
+    unless=_no_wrap,
+)
 def wrap_distance(context: Context) -> None:
     """The wrap lies on the native surface, filled segments apart."""
     diagonal = float(np.linalg.norm(np.ptp(context.wrap.native, axis=0)))
@@ -100,7 +118,7 @@ def _skin(context: Context) -> tuple[np.ndarray, Surface]:
     return context.wrap.vertices @ context.wrap_frame.T, Surface(native, place.reshape(-1, 3))
 
 
-@check("wrap-coverage", level="core", needs=("wrap-distance",), unless=_no_wrap)
+@check("wrap-coverage", mend='register that part again, or leave its faces out of `native.obj`', level="core", needs=("wrap-distance",), unless=_no_wrap)
 def wrap_coverage(context: Context) -> None:
     """Each segment of the wrap lies on the native surface, and what is native there under it."""
     wrap, surface = _skin(context)
@@ -131,7 +149,7 @@ def _no_fingers(context: Context) -> str:
     return _no_wrap(context)
 
 
-@check("wrap-fingers", level="core", needs=("wrap-distance",), unless=_no_fingers)
+@check("wrap-fingers", mend='`soma wrap`, or landmarks on the tips', level="core", needs=("wrap-distance",), unless=_no_fingers)
 def wrap_fingers(context: Context) -> None:
     """Each finger and toe of the wrap lies on one of the native surface, in their order."""
     wrap, surface = _skin(context)

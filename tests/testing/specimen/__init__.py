@@ -21,6 +21,7 @@ class Options:
 def soma_backend():
     return BackendSpec(
         name="specimen",
+        api=2,
         unit="cm",
         up="+z",
         forward="-y",
@@ -44,7 +45,7 @@ def soma_backend():
 def soma_generator(spec, device, dtype, options):
     from soma_backend_specimen._generator import Specimen
 
-    return Specimen(spec.wrap.native, options["strength"], device=device, dtype=dtype)
+    return Specimen(spec.wrap.native, options.strength, device=device, dtype=dtype)
 
 
 @hookimpl
@@ -52,3 +53,10 @@ def soma_checks():
     from soma_backend_specimen._checks import taller
 
     return [taller]
+
+
+@hookimpl
+def soma_motions():
+    from soma_backend_specimen._motion import FORMAT
+
+    return [FORMAT]
