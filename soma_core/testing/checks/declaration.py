@@ -120,7 +120,7 @@ def files_named(context: Context) -> None:
 
 @check("own-checks", mend="return a list of `Check`, ids once each", level="core", needs=("declares",))
 def own_checks(context: Context) -> None:
-    """The hooks soma_checks and soma_motions, where they are, give sound checks and motion formats."""
+    """The hooks soma_checks and soma_motions, where they are, give what they must."""
     context.registry.checks(context.name)
     context.registry.formats(context.name)
 

@@ -98,7 +98,7 @@ _OF_TWO_DEVICES = re.compile(
 
 @check("other-device", level="core", needs=("generator-device",), mend="make constants on the device given")
 def other_device(context: Context) -> None:
-    """The generator computes on another device than the CPU: a GPU, or torch's meta device without one."""
+    """The generator computes on another device: a GPU, or torch's meta device without one."""
     if torch.cuda.is_available():
         _compare_device(context, torch.device("cuda", torch.cuda.current_device()))
         return
