@@ -9,8 +9,10 @@ import subprocess
 import sys
 import tempfile
 import warnings
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from soma_core.plugin.discovery import Offer
 from soma_core.plugin.errors import BackendError, BackendWarning
@@ -66,6 +68,23 @@ def probe_import(offer: Offer) -> ImportProbe:
     )  # fmt: skip
 
 
+def _filters_of(package: str) -> list[str]:
+    """Note where `package` itself adds warning filters from now on; libraries do when they are imported."""
+    found: list[str] = []
+
+    def watched(plain: Callable[..., None]) -> Callable[..., None]:
+        def added(*given: Any, **named: Any) -> None:
+            module = str(sys._getframe(1).f_globals.get("__name__"))
+            found.extend([module] * (module.partition(".")[0] == package))
+            plain(*given, **named)
+
+        return added
+
+    warnings.filterwarnings = watched(warnings.filterwarnings)
+    warnings.simplefilter = watched(warnings.simplefilter)
+    return found
+
+
 def main(name: str, target: str, folder: str) -> None:
     """Declare backend `name` at entry point `target`; leave what was seen in `folder`."""
     warnings.simplefilter("ignore", BackendWarning)  # spoken by the core, not by the plugin
@@ -74,13 +93,15 @@ def main(name: str, target: str, folder: str) -> None:
     with open(Path(folder) / "output.txt", "wb") as stream:
         os.dup2(stream.fileno(), 1)
         os.dup2(stream.fileno(), 2)
+    own_filters = _filters_of(target.partition(":")[0].partition(".")[0])
     error, before = "", snapshot()
     try:
         registry.spec(name)
     except BackendError as reason:
         error = f"{reason.stage}: {reason.cause}"
     packages = sorted({module.partition(".")[0] for module in sys.modules})
-    document = {"packages": packages, "error": error, "changed": changes(before)}
+    changed = [part for part in changes(before) if part != "the warning filters" or own_filters]
+    document = {"packages": packages, "error": error, "changed": changed}
     (Path(folder) / "result.json").write_text(json.dumps(document))
 
 
