@@ -60,7 +60,9 @@ def find_configs(offers: Iterable[Offer], *, core: str) -> PluginConfigs:
 
 
 def _files(folder: Path) -> set[str]:
-    return {path.relative_to(folder).as_posix() for path in folder.rglob("*.yaml")}
+    return {
+        path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.suffix in (".yaml", ".json")
+    }
 
 
 def _clash(file: str, offers: list[Offer], core: str) -> BackendConflictError:
