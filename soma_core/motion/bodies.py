@@ -12,12 +12,13 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from soma_core.errors import AssetError, InputError, SomaError
+from soma_core.errors import AssetError, InputError
 from soma_core.io.amass import SmplMotion
 from soma_core.io.rotation_vectors import in_radians
 from soma_core.io.sam3d import Sam3dFrames, read_sam3d
 from soma_core.io.smpl_files import SmplChoices, read_smpl
 from soma_core.io.vertex_files import open_vertex_sequence
+from soma_core.motion.files import read_model_motion
 from soma_core.motion.models import (
     FitBackend,
     FitBackends,
@@ -28,8 +29,7 @@ from soma_core.motion.models import (
 from soma_core.motion.options import ConvertOptions, FitOptions, InvertOptions
 from soma_core.motion.posed_input import PosedInput
 from soma_core.motion.questions import of_params, of_rate, of_smpl
-from soma_core.plugin.declaration import motion_problem
-from soma_core.plugin.errors import BackendError, BrokenBackendError, PluginError
+from soma_core.plugin.errors import BackendError, BrokenBackendError
 from soma_core.plugin.registry import default_registry
 
 if TYPE_CHECKING:
@@ -106,19 +106,7 @@ def _model_body(path: Path, layout: str, options: FitOptions, backends: FitBacke
         SomaError: the file cannot be read, or the backend's model is not there.
         BackendError: the plugin fails, or what it gives is no motion.
     """
-    name, form = default_registry().motion_formats()[layout]
-    assert form.read is not None
-    try:
-        motion = form.read(path)
-    except Exception as error:
-        if isinstance(error, SomaError):
-            raise
-        with default_registry().isolated(name, "hooks"):
-            raise
-    with default_registry().isolated(name, "hooks"):
-        problem = motion_problem(motion)
-        if problem is not None:
-            raise PluginError(f"motion format {layout}: {problem}")
+    name, motion = read_model_motion(path, layout)
     backend = backends.get(name, motion.options)
     spec, params = backend.layer.spec, {key: np.asarray(each).tolist() for key, each in motion.params.items()}
     pose = {key: np.asarray(value) for key, value in motion.pose.items()}

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Literal
 
 from soma_core.choices import LengthUnit, Product
-from soma_core.errors import InputError
+from soma_core.errors import InputError, SomaError
 from soma_core.io.data_files import DATA_SUFFIXES, open_data
 from soma_core.io.gem_x import gem_x_parts, gem_x_result
 from soma_core.io.motion import Convention, Motion
@@ -21,7 +21,10 @@ from soma_core.io.smpl_bodies import shown_names
 from soma_core.io.smpl_files import smpl_layout
 from soma_core.motion.writers import WRITERS
 from soma_core.paths import expanded
+from soma_core.plugin.declaration import motion_problem
+from soma_core.plugin.errors import PluginError
 from soma_core.plugin.registry import default_registry
+from soma_core.plugin.spec import ModelMotion
 from soma_core.rig import load_canonical
 from soma_core.topology.frames import METRES
 
@@ -34,6 +37,7 @@ __all__ = [
     "motion_suffixes",
     "no_motion",
     "read",
+    "read_model_motion",
     "write",
 ]
 
@@ -115,6 +119,29 @@ def _plugin_format(path: Path) -> str | None:
         if each.read is not None and suffix in each.suffixes and {*each.keys} <= _keys(path, each.keys):
             return name
     return None
+
+
+def read_model_motion(path: Path, layout: str) -> tuple[str, ModelMotion]:
+    """A file of a plugin's format: the backend, and the motion that the plugin reads.
+
+    Raises:
+        SomaError: the plugin refuses the file.
+        BackendError: it fails, or what it gives is no motion.
+    """
+    name, form = default_registry().motion_formats()[layout]
+    assert form.read is not None
+    try:
+        motion = form.read(path)
+    except Exception as error:
+        if isinstance(error, SomaError):
+            raise
+        with default_registry().isolated(name, "hooks"):
+            raise
+    with default_registry().isolated(name, "hooks"):
+        problem = motion_problem(motion)
+        if problem is not None:
+            raise PluginError(f"motion format {layout}: {problem}")
+    return name, motion
 
 
 def _keys(path: Path, wanted: tuple[str, ...]) -> set[str]:
