@@ -100,12 +100,7 @@ def is_fitted(layout: str) -> bool:
 
 
 def _model_body(path: Path, layout: str, options: FitOptions, backends: FitBackends) -> ShownBody:
-    """The body of a file that a plugin reads, posed by the plugin's own model.
-
-    Raises:
-        SomaError: the file cannot be read, or the backend's model is not there.
-        BackendError: the plugin fails, or what it gives is no motion.
-    """
+    """The body of a file that a plugin reads, posed by the plugin's own model; see `read_model_motion`."""
     name, motion = read_model_motion(path, layout)
     backend = backends.get(name, motion.options)
     spec, params = backend.layer.spec, {key: np.asarray(each).tolist() for key, each in motion.params.items()}
