@@ -118,7 +118,13 @@ def _skin(context: Context) -> tuple[np.ndarray, Surface]:
     return context.wrap.vertices @ context.wrap_frame.T, Surface(native, place.reshape(-1, 3))
 
 
-@check("wrap-coverage", mend='register that part again, or leave its faces out of `native.obj`', level="core", needs=("wrap-distance",), unless=_no_wrap)
+@check(
+    "wrap-coverage",
+    mend="register that part again, or leave its faces out of `native.obj`",
+    level="core",
+    needs=("wrap-distance",),
+    unless=_no_wrap,
+)
 def wrap_coverage(context: Context) -> None:
     """Each segment of the wrap lies on the native surface, and what is native there under it."""
     wrap, surface = _skin(context)
@@ -149,7 +155,13 @@ def _no_fingers(context: Context) -> str:
     return _no_wrap(context)
 
 
-@check("wrap-fingers", mend='`soma wrap`, or landmarks on the tips', level="core", needs=("wrap-distance",), unless=_no_fingers)
+@check(
+    "wrap-fingers",
+    mend="`soma wrap`, or landmarks on the tips",
+    level="core",
+    needs=("wrap-distance",),
+    unless=_no_fingers,
+)
 def wrap_fingers(context: Context) -> None:
     """Each finger and toe of the wrap lies on one of the native surface, in their order."""
     wrap, surface = _skin(context)
