@@ -140,8 +140,9 @@ class PointFit:
         """Start from the points, or from an earlier result."""
         begun = [self.start(one.rest, one.points, one.weights) for one in self.chunks()]
         relative, hips, scale = (torch.cat(parts) for parts in zip(*begun, strict=True))
-        if bool(self.valid.any()):
-            refuse_unit_error(scale[self.valid], "points")
+        scale = scale[torch.isfinite(scale)]
+        if len(scale):
+            refuse_unit_error(scale, "points")
         if initial is not None:
             still = torch.eye(3).to(self.points).expand(len(self.points), 1, 3, 3)
             relative = torch.cat((still, initial.rotations.to(self.points)), 1)

@@ -21,6 +21,9 @@ _EXPECTED = 0.02
 _BEND = 0.5
 """Weight of the axis that a hinge bends about, beside the bone that leads to it."""
 
+_MEASURED = 128
+"""Frames whose size is told."""
+
 _SLIGHT = 0.4
 """Sine of a bend that may be noise."""
 
@@ -70,7 +73,7 @@ class PointStart(torch.nn.Module):
         self.owner = owner
 
     def forward(self, rest: PointRest, points: Tensor, weights: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Rotations (F, J, 3, 3), Hips positions (F, 3) [m], sizes (F,) beside the identity.
+        """Rotations (F, J, 3, 3), Hips positions (F, 3) [m], sizes (f,) of some frames.
 
         Args:
             rest: of one identity, or of one a frame.
@@ -88,13 +91,14 @@ class PointStart(torch.nn.Module):
         hips = points.new_zeros(count, 3)
         for joint, above, own, hinge in self.steps:
             expected = turns[:, above] @ mean[joint]
-            weight = weights * points.new_tensor(own)
-            arms = at_rest[:, joint]  # (i, P, 3) in the joint's axes
+            near = np.flatnonzero(own >= _FARTHER)  # what lies behind two joints that are seen tells nothing
+            weight, seen_points = weights[:, near] * points.new_tensor(own[near]), points[:, near]
+            arms = at_rest[:, joint, near]  # (i, p, 3) in the joint's axes
             if joint == 1:
                 total = weight.sum(1, keepdim=True).clamp_min(1e-12)
-                middle = (weight[..., None] * points).sum(1) / total
+                middle = (weight[..., None] * seen_points).sum(1) / total
                 inner = (weight[..., None] * arms).sum(1) / total
-                aims = points - middle[:, None]
+                aims = seen_points - middle[:, None]
                 turns[:, 1] = self._turn(weight, aims, arms - inner[:, None], expected, None)
                 hips = middle - (turns[:, 1] @ inner[..., None]).squeeze(-1)
                 places[:, 1] = hips
@@ -104,7 +108,7 @@ class PointStart(torch.nn.Module):
                 seen = weights[:, self.centre[joint], None] > 0
                 place = torch.where(seen, points[:, self.centre[joint]], place)
             places[:, joint] = place
-            aims = points - place[:, None]
+            aims = seen_points - place[:, None]
             turns[:, joint] = turn = self._turn(weight, aims, arms, expected, None)
             if hinge is not None:
                 bend = self._bend(hinge, points, weights, place, turn)
@@ -112,10 +116,12 @@ class PointStart(torch.nn.Module):
         variables = model.solver.variables
         relative = mean.repeat(count, 1, 1, 1)
         relative[:, variables] = turns[:, model.parents[variables]].mT @ turns[:, variables]
-        return relative, hips, self._scale(points, weights, at_rest)
+        some = slice(None, None, max(1, count // _MEASURED))
+        scale = self._scale(points[some], weights[some], at_rest if len(at_rest) == 1 else at_rest[some])
+        return relative, hips, scale
 
     def _scale(self, points: Tensor, weights: Tensor, at_rest: Tensor) -> Tensor:
-        """Median (F,) over the bones of how far points lie from their joint, beside how far they should.
+        """Median (f,) over the bones of how far points lie from their joint, beside how far they should.
 
         Bones between a joint that is seen and the nearest points below it; the whole cloud without such.
         """
@@ -131,7 +137,7 @@ class PointStart(torch.nn.Module):
             ratios.append(torch.where(total > 0, ratio, torch.nan))
         if not ratios:
             return points.new_ones(len(points))
-        return torch.stack(ratios, 1).nanmedian(1).values.nan_to_num(1.0)
+        return torch.stack(ratios, 1).nanmedian(1).values
 
     def _turn(self, weight: Tensor, aims: Tensor, arms: Tensor, expected: Tensor, bend) -> Tensor:
         """Turn (F, 3, 3) of arms (i, P, 3) towards aims (F, P, 3)."""

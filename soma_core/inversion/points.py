@@ -172,7 +172,9 @@ class PointInversion(Derived):
         """Size of a person beside a body, where no bone is seen."""
         known = torch.isfinite(points).all(-1)
         rest = self.model.rest(identity)
-        return float(self.start(rest, points.nan_to_num(0.0), known.to(points))[2].median())
+        return float(
+            self.start(rest, points.nan_to_num(0.0), known.to(points))[2].nanmedian().nan_to_num(1.0)
+        )
 
     def _checked(self, points: object) -> Tensor:
         if not isinstance(points, Tensor) or not points.is_floating_point():
