@@ -32,6 +32,7 @@ __all__ = [
     "Skinning",
     "SmplLayout",
     "SmplModel",
+    "Smooth",
     "Topology",
     "Translation",
     "Upward",
@@ -211,6 +212,14 @@ class RotationLayout(StrEnum):
     xyzw = "xyzw"
     rows = "rows"
     columns = "columns"
+
+
+class Smooth(StrEnum):
+    """How much a motion is smoothed."""
+
+    off = "off"
+    light = "light"
+    strong = "strong"
 
 
 class SmplModel(StrEnum):

@@ -59,6 +59,9 @@ TASKS = {
     "convert": TaskRow(
         module="convert", summary="bring motions of AMASS, SAM 3D Body and kimodo to this skeleton, and back"
     ),
+    "clean": TaskRow(
+        module="clean", summary="smooth a motion, replace spikes, resample, mirror; jitter and foot slide"
+    ),
     "wrap": TaskRow(module="wrap", summary="lay the canonical mesh on any human mesh: an OBJ pair, a report"),
     "train-shape": TaskRow(
         module="train_shape", summary="learn the native shape space from installed backends"

@@ -20,7 +20,7 @@ from soma_core.choices import (
     Product,
     Translation,
 )
-from soma_core.motion.options import ConvertOptions, InvertOptions
+from soma_core.motion.options import CleanOptions, ConvertOptions, InvertOptions
 from soma_core.motion.writers import WriteOptions, listed_writers
 from soma_core.options import BackendChoice, FrameRange, ModelOptions, Options, Picture, ViewOptions
 from soma_core.paths import configs_dir
@@ -29,6 +29,7 @@ __all__ = [
     "SCHEMAS",
     "AnimateConfig",
     "BenchConfig",
+    "CleanConfig",
     "ConvertConfig",
     "CorrectivesData",
     "EvaluateConfig",
@@ -102,6 +103,18 @@ class ConvertConfig(ConvertOptions):
 
     input: str | None = None
     out: str = MISSING
+    seed: int = 0
+
+
+@dataclass(kw_only=True)
+class CleanConfig(ModelOptions, CleanOptions):
+    """Configuration of ``soma clean``."""
+
+    input: str | None = None
+    motion_fps: float | None = None
+    person: str | None = None
+    motion_unit: LengthUnit | None = None
+    frames: FrameRange = field(default_factory=FrameRange)
     seed: int = 0
 
 
@@ -215,6 +228,7 @@ SCHEMAS: dict[str, type] = {
     "animate": AnimateConfig,
     "invert": InvertConfig,
     "convert": ConvertConfig,
+    "clean": CleanConfig,
     "train_shape": TrainShapeConfig,
     "train_correctives": TrainCorrectivesConfig,
     "evaluate": EvaluateConfig,

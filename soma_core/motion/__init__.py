@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from soma_core.io.bvh import read_bvh, write_bvh
     from soma_core.io.skeleton_motion import SkeletonMotion
     from soma_core.motion.animated import Animated, animate
+    from soma_core.motion.clean import Cleaned, clean, mirror, resample, smooth, without_spikes
     from soma_core.motion.conversion import (
         FolderConverted,
         convert,
@@ -25,9 +26,10 @@ if TYPE_CHECKING:
     from soma_core.motion.files import layout_of, read, write
     from soma_core.motion.fit_job import FitPlan, fit_chunks
     from soma_core.motion.identities import stored_identity
-    from soma_core.motion.options import ConvertOptions, FitOptions, InvertOptions
+    from soma_core.motion.options import CleanOptions, ConvertOptions, FitOptions, InvertOptions, LimbSeconds
     from soma_core.motion.played import Played
     from soma_core.motion.products import write_body, write_products
+    from soma_core.motion.quality import motion_quality
     from soma_core.motion.retarget import retarget
     from soma_core.motion.writers import WriteOptions
     from soma_core.options import BackendChoice, FrameRange, IdentityChoice, InversionChoice, Picture
@@ -35,6 +37,8 @@ if TYPE_CHECKING:
 __all__ = [
     "Animated",
     "BackendChoice",
+    "CleanOptions",
+    "Cleaned",
     "ConvertOptions",
     "Converted",
     "FitOptions",
@@ -44,11 +48,13 @@ __all__ = [
     "IdentityChoice",
     "InversionChoice",
     "InvertOptions",
+    "LimbSeconds",
     "Picture",
     "Played",
     "SkeletonMotion",
     "WriteOptions",
     "animate",
+    "clean",
     "convert",
     "convert_file",
     "convert_folder",
@@ -58,11 +64,16 @@ __all__ = [
     "invert",
     "layout_of",
     "load_clip",
+    "mirror",
+    "motion_quality",
     "plan_fit",
     "read",
     "read_bvh",
+    "resample",
     "retarget",
+    "smooth",
     "stored_identity",
+    "without_spikes",
     "write",
     "write_body",
     "write_bvh",
@@ -73,6 +84,7 @@ _HOMES = {
     "soma_core.io.bvh": ["read_bvh", "write_bvh"],
     "soma_core.io.skeleton_motion": ["SkeletonMotion"],
     "soma_core.motion.animated": ["Animated", "animate"],
+    "soma_core.motion.clean": ["Cleaned", "clean", "mirror", "resample", "smooth", "without_spikes"],
     "soma_core.motion.conversion": [
         "FolderConverted",
         "convert",
@@ -85,9 +97,10 @@ _HOMES = {
     "soma_core.motion.files": ["layout_of", "read", "write"],
     "soma_core.motion.fit_job": ["FitPlan", "fit_chunks"],
     "soma_core.motion.identities": ["stored_identity"],
-    "soma_core.motion.options": ["ConvertOptions", "FitOptions", "InvertOptions"],
+    "soma_core.motion.options": ["CleanOptions", "ConvertOptions", "FitOptions", "InvertOptions", "LimbSeconds"],
     "soma_core.motion.played": ["Played"],
     "soma_core.motion.products": ["write_body", "write_products"],
+    "soma_core.motion.quality": ["motion_quality"],
     "soma_core.motion.retarget": ["retarget"],
     "soma_core.motion.writers": ["WriteOptions"],
     "soma_core.options": ["BackendChoice", "FrameRange", "IdentityChoice", "InversionChoice", "Picture"],

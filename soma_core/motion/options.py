@@ -25,6 +25,7 @@ from soma_core.choices import (
     RotationZero,
     SmplLayout,
     SmplModel,
+    Smooth,
     Topology,
     Translation,
     Upward,
@@ -38,7 +39,7 @@ from soma_core.topology.frames import METRES
 if TYPE_CHECKING:
     from soma_core.plugin.spec import Unit
 
-__all__ = ["ConvertOptions", "FitOptions", "InvertOptions", "SourceOptions"]
+__all__ = ["CleanOptions", "ConvertOptions", "FitOptions", "InvertOptions", "LimbSeconds", "SourceOptions"]
 
 
 SIGNED: dict[str, UpAxis] = {"y": "+y", "z": "+z", "-y": "-y", "-z": "-z"}
@@ -252,3 +253,56 @@ class ConvertOptions(WriteOptions, FitOptions):
             )  # fmt: skip
         for name, value in self.given().items():
             raise InputError(name, got=value, expected=f"none with to={self.to}", fix=f"Leave {name} out.")
+
+
+@dataclass(kw_only=True)
+class LimbSeconds(Options):
+    """How long a stretch of time a motion is smoothed over, by limb [s]; `path` is that of the Hips.
+
+    None and 0 leave a limb alone, in :class:`CleanOptions` None is what the preset has.
+    """
+
+    path: float | None = None
+    hips: float | None = None
+    spine: float | None = None
+    head: float | None = None
+    arms: float | None = None
+    hands: float | None = None
+    fingers: float | None = None
+    legs: float | None = None
+    feet: float | None = None
+
+    def __post_init__(self) -> None:
+        """Refuse what is no such time."""
+        super().__post_init__()
+        for name, value in vars(self).items():
+            if value is not None and not 0 <= value <= 1:
+                raise InputError(
+                    f"seconds.{name}", got=value, expected="0, which leaves it alone, to 1 second",
+                    fix=f"Try seconds.{name}=0.05.",
+                )  # fmt: skip
+
+
+@dataclass(kw_only=True)
+class CleanOptions(Options):
+    """What is done to a motion, in this order.
+
+    Attributes:
+        spikes: whether frames in which a joint sticks out are replaced.
+        smooth: preset of smoothing.
+        seconds: of limbs that are smoothed otherwise.
+        rate: frames per second of the result; None: as they are.
+        mirror: whether left and right change places.
+    """
+
+    spikes: bool = True
+    smooth: Smooth = Smooth.light
+    seconds: LimbSeconds = field(default_factory=LimbSeconds)
+    rate: float | None = None
+    mirror: bool = False
+
+    def __post_init__(self) -> None:
+        """Refuse a rate that is none."""
+        super().__post_init__()
+        if self.rate is not None and not 0 < self.rate <= 10_000:
+            raise InputError("rate", got=self.rate, expected="frames per second", fix="Try rate=30.")
