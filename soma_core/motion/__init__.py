@@ -13,7 +13,15 @@ if TYPE_CHECKING:
     from soma_core.io.bvh import read_bvh, write_bvh
     from soma_core.io.skeleton_motion import SkeletonMotion
     from soma_core.motion.animated import Animated, animate
-    from soma_core.motion.clean import Cleaned, clean, mirror, resample, smooth, without_spikes
+    from soma_core.motion.cleaning import (
+        Cleaned,
+        clean,
+        mirror,
+        mirrored_body,
+        resample,
+        smooth,
+        without_spikes,
+    )
     from soma_core.motion.conversion import (
         FolderConverted,
         convert,
@@ -65,6 +73,7 @@ __all__ = [
     "layout_of",
     "load_clip",
     "mirror",
+    "mirrored_body",
     "motion_quality",
     "plan_fit",
     "read",
@@ -84,7 +93,15 @@ _HOMES = {
     "soma_core.io.bvh": ["read_bvh", "write_bvh"],
     "soma_core.io.skeleton_motion": ["SkeletonMotion"],
     "soma_core.motion.animated": ["Animated", "animate"],
-    "soma_core.motion.clean": ["Cleaned", "clean", "mirror", "resample", "smooth", "without_spikes"],
+    "soma_core.motion.cleaning": [
+        "Cleaned",
+        "clean",
+        "mirror",
+        "mirrored_body",
+        "resample",
+        "smooth",
+        "without_spikes",
+    ],
     "soma_core.motion.conversion": [
         "FolderConverted",
         "convert",
@@ -97,7 +114,13 @@ _HOMES = {
     "soma_core.motion.files": ["layout_of", "read", "write"],
     "soma_core.motion.fit_job": ["FitPlan", "fit_chunks"],
     "soma_core.motion.identities": ["stored_identity"],
-    "soma_core.motion.options": ["CleanOptions", "ConvertOptions", "FitOptions", "InvertOptions", "LimbSeconds"],
+    "soma_core.motion.options": [
+        "CleanOptions",
+        "ConvertOptions",
+        "FitOptions",
+        "InvertOptions",
+        "LimbSeconds",
+    ],
     "soma_core.motion.played": ["Played"],
     "soma_core.motion.products": ["write_body", "write_products"],
     "soma_core.motion.quality": ["motion_quality"],

@@ -11,7 +11,7 @@ from omegaconf import OmegaConf
 
 from soma_core.cache import atomic_text
 from soma_core.errors import InputError
-from soma_core.motion.clean import clean
+from soma_core.motion.cleaning import clean
 from soma_core.motion.conversion import load_clip
 from soma_core.motion.files import write
 
@@ -34,7 +34,7 @@ def run(config: DictConfig, output: Path) -> None:
     Raises:
         SomaError: the motion cannot be read.
     """
-    options: CleanConfig = OmegaConf.to_object(config)
+    options: CleanConfig = OmegaConf.to_object(config)  # type: ignore[assignment]
     if not options.input:
         raise InputError("input", got="none", expected="a motion file", fix="Pass input=FILE.")
     motion = load_clip(

@@ -5,10 +5,11 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import scipy.sparse
+import torch
 from scipy.interpolate import CubicSpline
 from scipy.linalg import solveh_banded
 from scipy.ndimage import median_filter
@@ -16,12 +17,17 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from soma_core.choices import Smooth
 from soma_core.errors import InputError
+from soma_core.io.joint_order import USER_JOINTS
 from soma_core.io.motion import Motion
 from soma_core.motion.options import CleanOptions, LimbSeconds
 from soma_core.motion.quality import motion_quality, relative_rotations
 from soma_core.rig import load_canonical
 
-__all__ = ["Cleaned", "clean", "mirror", "resample", "smooth", "without_spikes"]
+if TYPE_CHECKING:
+    from soma_core.layer import SomaLayer
+    from soma_core.skeleton.identity import Identity
+
+__all__ = ["Cleaned", "clean", "mirror", "mirrored_body", "resample", "smooth", "without_spikes"]
 
 _LIMBS = {
     "hips": r"Hips", "spine": r"Spine\d|Chest", "head": r"Neck\d|Head|HeadEnd|Jaw|.*Eye",
@@ -42,13 +48,14 @@ PRESETS: Mapping[Smooth, LimbSeconds] = {
 }  # fmt: skip
 """Gains [s]: 0.025 keeps three quarters of what swings at 6.4 Hz, the usual limit of gait analysis."""
 
-_LONGEST = 3
-"""Frames in a row that may stick out together; what lasts longer may be a movement."""
+_SPANS = (1, 3, 6)
+"""Error of a cubic over gaps of one frame, two and three, in that over one: products of the distances to its
+nodes, over 4. Up to so many frames may stick out together; what lasts longer may be a movement."""
 
 _ROUNDS = 4
 """How often spikes are looked for: those close to others are seen once these are gone."""
 
-_ANGLE, _PLACE = np.radians(10), 0.05
+_ANGLE, _PLACE = np.radians(15), 0.05
 """How far a joint [rad] and the Hips [m] must at least be from where their neighbours expect them."""
 
 _RATIO, _AROUND = 8.0, 0.5
@@ -101,8 +108,8 @@ def without_spikes(motion: Motion) -> tuple[Motion, dict[str, list[int]]]:
     """Replace frames in which a joint, or the path, sticks out on both sides of its neighbours.
 
     A run of up to three frames sticks out where it is further from the cubic through the two frames before
-    and after than 10 degrees or 50 mm, and than 8 times the median of that in the second around; and as
-    clearly from the frames next to it, which a step from one pose to another is not. Joints are then
+    and after than 15 degrees or 50 mm, and than 8 times what is usual of so many in the second around; and as
+    far from the frames next to it, which a step from one pose to another is not. Joints are then
     interpolated along the shortest arc, the path along a line; the first and last frames take the pose
     beside them.
 
@@ -205,8 +212,8 @@ def mirror(motion: Motion) -> Motion:
 
     Turns from the T-pose in world axes become ``S R S`` of the joint of the other side, S = diag(-1, 1, 1);
     places, contacts, the recorded skeleton and a kept rest shape follow. Twice is the motion again, to the
-    bit, of rotations from the T-pose. On the mirror image of a body, which of a symmetric one is the body itself, joints and skin are the
-    mirror image of what they were.
+    bit, of rotations from the T-pose. On the mirror image of a body, :func:`mirrored_body`, joints and skin
+    are the mirror image of what they were, as far as skin weights and pose correctives have that symmetry.
 
     Args:
         motion: any. Its body's parameters, which know no sides, are kept.
@@ -227,6 +234,33 @@ def mirror(motion: Motion) -> Motion:
     )
 
 
+def mirrored_body(layer: SomaLayer, identity: Identity) -> Identity:
+    """Mirror image of a body, which mirrored motions are exact on; no body is quite its own mirror image.
+
+    Args:
+        layer: whose mesh and rig the body is of.
+        identity: any number of them; their parameters are kept, and are those of the body before.
+    """
+    other = [0, *(1 + row for row in _other_side(USER_JOINTS))]
+    partner = torch.as_tensor(layer.mesh.mirror.astype(np.int64), device=identity.rest.device)
+    flip = identity.rest.new_tensor([-1.0, 1.0, 1.0])
+    zero = torch.tensor(layer.rig.t_pose_world[:, :3, :3]).to(identity.rest)
+
+    def skeleton(world: torch.Tensor) -> torch.Tensor:
+        turned = (world[..., :3, :3] @ zero.transpose(-1, -2))[:, other] * (flip[:, None] * flip)
+        changed = world[:, other].clone()
+        changed[..., :3, :3], changed[..., :3, 3] = turned @ zero, world[:, other, :3, 3] * flip
+        return changed
+
+    return replace(
+        identity,
+        rest=identity.rest[:, partner] * flip,
+        bind_world=skeleton(identity.bind_world),
+        fitted_rest=identity.fitted_rest[:, partner] * flip,
+        fitted_world=skeleton(identity.fitted_world),
+    )
+
+
 def _mirrored_rest(identity: Mapping[str, Any]) -> Mapping[str, Any]:
     """The kept body, its rest shape mirrored if it has one."""
     if identity.get("rest") is None:
@@ -241,7 +275,7 @@ def _mirrored_rest(identity: Mapping[str, Any]) -> Mapping[str, Any]:
 
 def _reflected(rotations: np.ndarray, other: list[int]) -> np.ndarray:
     """``S R S`` of the joints of the other side; only signs change."""
-    signs = np.array([[1, -1, -1], [-1, 1, 1], [-1, 1, 1]], rotations.dtype)
+    signs = np.outer([-1, 1, 1], [-1, 1, 1]).astype(rotations.dtype)
     return rotations[:, other] * signs
 
 
@@ -299,21 +333,22 @@ def _spikes(values: np.ndarray, fps: float, least: float) -> np.ndarray:
     bad = np.zeros(values.shape[:2], bool)
     if len(values) < 5:
         return bad
-    scores = [_sticking_out(values, length) for length in range(1, _LONGEST + 1)]
+    scores = [_sticking_out(values, length) for length in range(1, len(_SPANS) + 1)]
     around = 2 * round(_AROUND * fps) + 1
     usual = median_filter(scores[0], (around, 1), mode="nearest")
-    limit = np.maximum(_RATIO * usual, least)
-    for column in np.flatnonzero((np.max(scores, axis=0) > limit).any(axis=0)):
+    over = [
+        score > np.maximum(_RATIO * span * usual, least) for span, score in zip(_SPANS, scores, strict=True)
+    ]
+    for column in np.flatnonzero(np.any(over, axis=(0, 1))):
         runs = [
-            (scores[length - 1][start, column], start, length)
-            for length in range(1, _LONGEST + 1)
-            for start in np.flatnonzero(scores[length - 1][:, column] > limit[:, column])
-        ]
-        taken = np.zeros(len(values) + 2 * _LONGEST, bool)  # a spike also bends what is expected beside it
+            (scores[index][start, column], start, index + 1)
+            for index, found in enumerate(over) for start in np.flatnonzero(found[:, column])
+        ]  # fmt: skip
+        taken = np.zeros(len(values) + 2 * len(_SPANS), bool)  # a spike also bends what is expected beside it
         for _, start, length in sorted(runs, reverse=True):
-            if not taken[start : start + length + 2 * _LONGEST].any():
+            if not taken[start : start + length + 2 * len(_SPANS)].any():
                 bad[start : start + length, column] = True
-                taken[start + _LONGEST : start + _LONGEST + length] = True
+                taken[start + len(_SPANS) : start + len(_SPANS) + length] = True
     return bad
 
 
@@ -331,7 +366,7 @@ def _sticking_out(values: np.ndarray, length: int) -> np.ndarray:
         expected = np.tensordot(weights, expected_from, axes=(0, 1))
         far = np.minimum(far, _norm(values[starts + place] - expected))
     beside = [values[starts] - values[starts - 1], values[starts + length - 1] - values[starts + length]]
-    out[starts] = np.minimum(far, 2 * np.minimum(*map(_norm, beside)))
+    out[starts] = np.minimum(far, np.minimum(*map(_norm, beside)))
     if length == 1:
         for end, (one, two) in ((0, (1, 2)), (-1, (-2, -3))):
             guesses = values[one], values[two], 2 * values[one] - values[two]
