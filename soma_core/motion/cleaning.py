@@ -149,18 +149,18 @@ def _round(motion: Motion) -> tuple[Motion, dict[str, list[int]]]:
 def smooth(motion: Motion, seconds: LimbSeconds) -> Motion:
     """Smooth rotations and path without lag: what swings slowly stays, to the ends of the clip.
 
-    Each joint's unit quaternions, and the path, are those of a smoothing spline, which is the
-    Rauch-Tung-Striebel smoother of a constant velocity: x minimises ``|x - y|^2 + (s fps)^4 |x''|^2``, with
-    the gain ``1 / (1 + (2 pi f s)^4)`` of a second-order Butterworth filter run forward and backward. What it
-    took away is smoothed again and given back (Tukey's twicing), which leaves slow swings alone to the
-    square of that. Quaternions are brought to length one: turns in any frame of reference are smoothed alike,
-    and one of constant speed is kept.
+    Each joint's unit quaternions, and the path, become a smoothing spline, which is what a
+    Rauch-Tung-Striebel smoother of constant acceleration finds: x minimises ``|x - y|^2 + (s fps)^6 |d|^2``
+    with the third differences d of x, and the gain ``1 / (1 + (2 pi f s)^6)`` of a third-order Butterworth
+    filter run forward and backward. What it took away is smoothed again and given back (Tukey's twicing),
+    which leaves slow swings alone to the square of that. Quaternions are brought to length one: turns in any
+    frame of reference are smoothed alike, and one of constant speed is kept.
 
     Args:
-        motion: of any length; fewer than three frames stay as they are.
+        motion: of any length; fewer than four frames stay as they are.
         seconds: s of each limb [s]; None and 0 leave it alone.
     """
-    if motion.frame_count < 3:
+    if motion.frame_count < 4:
         return motion
     rotations, translation = motion.rotations.copy(), motion.translation
     for limb, gain in asdict(seconds).items():
@@ -318,10 +318,10 @@ def _slerp(rotations: np.ndarray, times: np.ndarray, wanted: np.ndarray) -> np.n
 def _spline(values: np.ndarray, frames: float) -> np.ndarray:
     """Values (n, ...) of a twiced smoothing spline whose gain is so many frames."""
     count, flat = len(values), values.reshape(len(values), -1)
-    bend = scipy.sparse.diags_array([1.0, -2.0, 1.0], offsets=[0, 1, 2], shape=(count - 2, count))
-    system = (scipy.sparse.eye_array(count) + frames**4 * (bend.T @ bend)).todia()
-    banded = np.zeros((3, count))
-    for offset in range(3):
+    turn = scipy.sparse.diags_array([-1.0, 3.0, -3.0, 1.0], offsets=range(4), shape=(count - 3, count))
+    system = (scipy.sparse.eye_array(count) + frames**6 * (turn.T @ turn)).todia()
+    banded = np.zeros((4, count))
+    for offset in range(4):
         banded[offset, : count - offset] = system.diagonal(offset)
     first = solveh_banded(banded, flat, lower=True)
     twiced = first + solveh_banded(banded, flat - first, lower=True)
@@ -335,7 +335,7 @@ def _spikes(values: np.ndarray, fps: float, least: float) -> np.ndarray:
         return bad
     scores = [_sticking_out(values, length) for length in range(1, len(_SPANS) + 1)]
     around = 2 * round(_AROUND * fps) + 1
-    usual = median_filter(scores[0], (around, 1), mode="nearest")
+    usual = median_filter(scores[0], (around, 1), mode="mirror")
     over = [
         score > np.maximum(_RATIO * span * usual, least) for span, score in zip(_SPANS, scores, strict=True)
     ]
@@ -368,8 +368,8 @@ def _sticking_out(values: np.ndarray, length: int) -> np.ndarray:
     beside = [values[starts] - values[starts - 1], values[starts + length - 1] - values[starts + length]]
     out[starts] = np.minimum(far, np.minimum(*map(_norm, beside)))
     if length == 1:
-        for end, (one, two) in ((0, (1, 2)), (-1, (-2, -3))):
-            guesses = values[one], values[two], 2 * values[one] - values[two]
+        for end, (one, two, three) in ((0, values[1:4]), (-1, values[-2:-5:-1])):
+            guesses = one, two, 2 * one - two, 3 * one - 3 * two + three
             out[end] = np.min([_norm(values[end] - guess) for guess in guesses], axis=0)
     return out
 

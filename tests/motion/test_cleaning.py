@@ -95,9 +95,9 @@ def test_smooth_motions_stay(seed):
 def test_a_steady_turn_stays_at_any_gain():
     """Quaternions of a turn of constant speed lie on a circle, which smoothing shrinks, but does not turn."""
     motion = swinging(0, fps=30, frames=90)
-    change = degrees(motion, smooth(motion, LimbSeconds(hips=0.2)))
-    assert change[30:-30, 0].max() < CHANGED_DEG
-    assert change[:, 1:].max() == 0
+    found = smooth(motion, LimbSeconds(hips=0.06))
+    assert degrees(motion, found)[:, 0].max() < CHANGED_DEG
+    assert (found.rotations[:, 1:] == motion.rotations[:, 1:]).all()
 
 
 @pytest.mark.parametrize("seed", [0, 1])
@@ -135,32 +135,33 @@ def test_smoothing_follows_any_frame_of_reference():
 def test_limbs_are_smoothed_by_their_own_gain():
     motion = noisy(swinging(4), 3.0)
     assert all(map(_limb, USER_JOINTS))
-    changed = degrees(motion, smooth(motion, LimbSeconds(arms=0.05))).max(axis=0) > 0
+    changed = (smooth(motion, LimbSeconds(arms=0.05)).rotations != motion.rotations).any(axis=(0, 2, 3))
     assert {_limb(name) for name, each in zip(USER_JOINTS, changed, strict=True) if each} == {"arms"}
     options = CleanOptions(smooth="strong", seconds=LimbSeconds(arms=0.0), spikes=False)
-    found = degrees(motion, clean(motion, options=options).motion)
-    assert found[:, USER_JOINTS.index("LeftArm")].max() == 0
-    assert found[:, USER_JOINTS.index("LeftLeg")].max() > 1
+    changed = (clean(motion, options=options).motion.rotations != motion.rotations).any(axis=(0, 2, 3))
+    assert changed[USER_JOINTS.index("LeftLeg")]
+    assert not changed[USER_JOINTS.index("LeftArm")]
 
 
 @pytest.mark.parametrize("frame", [0, 1, 2, 20, FRAMES - 2, FRAMES - 1])
 @pytest.mark.parametrize("angle", [40.0, 170.0])
 def test_a_spike_in_one_frame_goes(frame, angle):
     true = swinging(5)
-    for joint in (0, 12, 70):
-        spiked = turned(true, [frame], joint, angle, seed=joint)
-        found, replaced = without_spikes(spiked)
-        assert replaced == {USER_JOINTS[joint]: [frame]}
-        at_an_end = 3 if frame in (0, FRAMES - 1) else 1  # the pose beside it, a frame away
-        assert degrees(true, found).max() < at_an_end * LEFT_DEG
-        assert degrees(true, clean(spiked).motion)[:, joint].max() < at_an_end * LEFT_DEG
+    joint, end = (7 * frame + 5) % 77, frame in (0, FRAMES - 1)
+    spiked = turned(true, [frame], joint, angle, seed=frame)
+    found, replaced = without_spikes(spiked)
+    assert replaced == {USER_JOINTS[joint]: [frame]}
+    left = 3 * LEFT_DEG if end else LEFT_DEG  # the pose beside it, a frame away
+    assert degrees(true, found).max() < left
+    assert degrees(true, smooth(found, EVERY))[:, joint].max() < left
 
 
 def test_spikes_of_three_frames_and_close_to_each_other_go():
     calm = swinging(6, frequency=0.2)
     spiked = turned(turned(calm, [10, 11, 12], 13, 60.0), [30, 32, 35], 13, 40.0, seed=1)
     found, replaced = without_spikes(spiked)
-    assert replaced == {"LeftForeArm": [10, 11, 12, 30, 32, 35]} or set(replaced) == {USER_JOINTS[13]}
+    assert set(replaced) == {USER_JOINTS[13]}
+    assert set(replaced[USER_JOINTS[13]]) >= {10, 11, 12, 30, 32, 35}
     assert degrees(calm, found).max() < LEFT_DEG
 
 
@@ -210,8 +211,8 @@ def test_mirrored_twice_is_the_motion(convention):
     motion = replace(swinging(13), convention=convention, identity={"backend": "soma", "rest": rest})
     once = mirror(motion)
     twice = mirror(once)
-    exact = convention == "t_pose_relative"
-    assert degrees(motion, twice).max() == (0 if exact else pytest.approx(0, abs=1e-3))
+    rounding = 0 if convention == "t_pose_relative" else 1e-6
+    assert np.abs(twice.rotations - motion.rotations).max() <= rounding
     for name in ("translation", "contacts", "skeleton"):
         assert (getattr(twice, name) == getattr(motion, name)).all()
         assert (getattr(once, name) != getattr(motion, name)).any()
@@ -234,14 +235,14 @@ def _other(name: str) -> str:
 def test_skin_of_the_mirrored_motion_is_the_mirror_image():
     layer = SomaLayer("soma", lod="low", correctives=None, dtype=torch.float64)
     motion = swinging(15, frames=4)
-    coefficients = layer.identity({"shape": torch.linspace(-2, 2, 8)})
-    image = mirrored_body(layer, coefficients)
+    body = layer.identity({"shape": torch.linspace(-2, 2, 8, dtype=torch.float64)})
+    image = mirrored_body(layer, body)
 
-    def posed(body, moved):
+    def posed(shown, moved):
         values = (torch.as_tensor(each).double() for each in (moved.rotations, moved.translation))
-        return layer.pose(body, *values).vertices.numpy()
+        return layer.pose(shown, *values).vertices.numpy()
 
-    expected = posed(coefficients, motion)[:, layer.mesh.mirror] * [-1, 1, 1]
+    expected = posed(body, motion)[:, layer.mesh.mirror] * [-1, 1, 1]
     rig = layer.rig
     weights = rig.weights.toarray()
     columns = [rig.joint_names.index(_other(name)) for name in rig.joint_names]
@@ -249,18 +250,16 @@ def test_skin_of_the_mirrored_motion_is_the_mirror_image():
     assert even.mean() > 0.9
     error = 1e3 * np.linalg.norm(posed(image, mirror(motion)) - expected, axis=-1)
     assert error[:, even].max() < MIRROR_MM
-    assert torch.equal(mirrored_body(layer, image).rest, coefficients.rest)
+    assert torch.equal(mirrored_body(layer, image).rest, body.rest)
 
 
 def test_the_order_is_spikes_smoothing_rate_mirror():
     motion = turned(noisy(swinging(16), 0.5), [20], 13, 40.0)
-    options = CleanOptions(rate=60.0, mirror=True)
-    found = clean(motion, options=options)
-    by_hand = clean(motion).motion
-    by_hand = mirror(resample(by_hand, 60.0))
-    assert degrees(found.motion, by_hand).max() < 1e-3
-    assert found.report["spikes"] == {"LeftForeArm": [20]} or list(found.report["spikes"].values()) == [[20]]
-    assert found.report["frames"] == {"before": FRAMES, "after": 2 * FRAMES - 1}
+    found = clean(motion, options=CleanOptions(rate=15.0, mirror=True))
+    by_hand = mirror(resample(clean(motion).motion, 15.0))
+    assert (found.motion.rotations == by_hand.rotations).all()
+    assert found.report["spikes"] == {USER_JOINTS[13]: [20]}
+    assert found.report["frames"] == {"before": FRAMES, "after": FRAMES // 2}
     assert found.report["after"]["jitter_m_s3"] < found.report["before"]["jitter_m_s3"]
 
 
