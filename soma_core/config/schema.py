@@ -246,7 +246,7 @@ def _listed_products(program: str) -> str:
     return f"Products, write=[NAME,...]:\n{listed_writers()}\n\n"
 
 
-_EXPLAINED = re.compile(r"^(?:  - )?(?P<key>[a-z]\w*): [^#]*# (?P<text>.+)$", re.MULTILINE)
+_EXPLAINED = re.compile(r"^(?:  - )?(?P<key>[a-z]\w*): [^#\n]*# (?P<text>.+)$", re.MULTILINE)
 """A key of a task or of its defaults in a file, and the comment beside it."""
 
 
