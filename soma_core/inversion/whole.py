@@ -177,11 +177,16 @@ class WholeFit:
     def settled(self, problem: Problem, pose: Pose) -> Pose:
         """Plain skinning's poses, descended on where steps on moments were refused before they rested.
 
-        Where another rig moved the skin, every other one is: they know nothing of the error that stays.
+        Where another rig moved the skin, every other one is: they know nothing of the error that stays. Where
+        nothing is left, what still moves are turns that hardly any vertex tells, and the steps are the best.
         """
         moving = ~(pose.last_change < self.options.tolerance) & (pose.accepted < self.options.iterations)
-        rows = torch.nonzero(moving).flatten()
-        if not len(rows) or not self.options.refreshes:
+        if not self.options.refreshes or not bool(moving.any()):
+            return pose
+        _, energy = self.model.distances(problem, pose, energy_only=True)
+        left = (energy / problem.weights.sum(1).clamp_min(1e-12)).sqrt()
+        rows = torch.nonzero(moving & (left > _DOUBTFUL[1])).flatten()
+        if not len(rows):
             return pose
         rows = problem.several(rows)
         part, _ = self._descended(self.model, problem.part(rows), pose.part(rows), None)
