@@ -58,7 +58,7 @@ _ROUNDS = 4
 _ANGLE, _PLACE = np.radians(15), 0.05
 """How far a joint [rad] and the Hips [m] must at least be from where their neighbours expect them."""
 
-_RATIO, _AROUND = 8.0, 0.5
+_RATIO, _AROUND = 6.0, 0.5
 """And how many times the median of that within so many seconds before and after."""
 
 
@@ -108,7 +108,7 @@ def without_spikes(motion: Motion) -> tuple[Motion, dict[str, list[int]]]:
     """Replace frames in which a joint, or the path, sticks out on both sides of its neighbours.
 
     A run of up to three frames sticks out where it is further from the cubic through the two frames before
-    and after than 15 degrees or 50 mm, and than 8 times what is usual of so many in the second around; and as
+    and after than 15 degrees or 50 mm, and than 6 times what is usual of so many in the second around; and as
     far from the frames next to it, which a step from one pose to another is not. Joints are then
     interpolated along the shortest arc, the path along a line; the first and last frames take the pose
     beside them.
