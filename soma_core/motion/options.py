@@ -23,6 +23,7 @@ from soma_core.choices import (
     Refine,
     RotationLayout,
     RotationZero,
+    Skinning,
     Smooth,
     SmplLayout,
     SmplModel,
@@ -135,6 +136,7 @@ class ConvertOptions(WriteOptions, FitOptions):
     Attributes:
         backend: whose body moves, on the way back and in what is written of a body; in whose shapes an
             unknown body is sought.
+        inversion: how poses are found: those of the full model, which plays them.
         to: ``soma`` for this skeleton, else the backend to go back to; or a product, as with `write`.
         write: products, of ``soma_core.motion.writers``. To this skeleton they come beside the motion, which
             is always written; on the way back they are meshes of the model. None: the motion, or what
@@ -169,6 +171,7 @@ class ConvertOptions(WriteOptions, FitOptions):
     """
 
     to: str = "soma"
+    inversion: InversionChoice = field(default_factory=lambda: InversionChoice(skinning=Skinning.full))
     write: list[Product] | None = None
     carry: Carry = Carry.fit
     mapping: str | None = None

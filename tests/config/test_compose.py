@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -131,8 +132,9 @@ def test_a_wrong_override_is_named_in_full(run: Run, override: str, text: str, t
 def test_a_backend_that_is_not_installed_is_reported_in_our_words(
     run: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setitem(KNOWN_BACKENDS, "absent", "soma-backend-absent")
-    with pytest.raises(UnknownBackendError, match='"absent".*Run: pip install soma-backend-absent'):
+    known = replace(KNOWN_BACKENDS["toy"], name="absent", distribution="soma-backend-absent")
+    monkeypatch.setitem(KNOWN_BACKENDS, "absent", known)
+    with pytest.raises(UnknownBackendError, match=r'"absent".*pip install \./plugins/absent'):
         run("backend=absent")
     with pytest.raises(UnknownBackendError, match='"absent"'):
         run("--multirun", "backend=soma,absent")

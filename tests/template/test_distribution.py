@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import sys
 import tomllib
+from collections.abc import Iterator
 from importlib.metadata import EntryPoint
 from pathlib import Path
 
@@ -31,14 +33,16 @@ def acme(tmp_path_factory) -> Path:
 
 
 @pytest.fixture
-def layer(acme, monkeypatch) -> SomaLayer:
-    """The generated backend, imported from its folder through its own entry point."""
+def layer(acme, monkeypatch) -> Iterator[SomaLayer]:
+    """The generated backend, imported from its folder through its own entry point, and forgotten again."""
     monkeypatch.syspath_prepend(str(acme))
     project = tomllib.loads((acme / "pyproject.toml").read_text())["project"]
     ((name, target),) = project["entry-points"]["soma_core.backends"].items()
     point = EntryPoint(name=name, value=target, group="soma_core.backends")
     entry = FakeEntryPoint(name, load=point.load, value=target, distribution=project["name"])
-    return SomaLayer("acme", lod="low", registry=Registry([entry]))
+    yield SomaLayer("acme", lod="low", registry=Registry([entry]))
+    for imported in [each for each in sys.modules if each.partition(".")[0] == "soma_backend_acme"]:
+        del sys.modules[imported]
 
 
 def test_the_folder_holds_exactly_what_an_author_needs(acme):
