@@ -94,14 +94,18 @@ def coverage(
     near = max(_NEAR * np.linalg.norm(np.ptp(wrap, axis=0)), float(np.median(sides)) / 2)
     names, place = _segments(rig)
     contact = surface.closest(wrap)
-    along = (contact.normals * vertex_normals(wrap, triangles)).sum(1) > 0
+    # Toes lie folded on a foot or a shoe without any, which sees both sides of them; `matches` tells toes apart.
+    feet = np.array([name.endswith("Foot") for name in names])[place]
+    along = ((contact.normals * vertex_normals(wrap, triangles)).sum(1) > 0) | feet
     on = (np.linalg.norm(contact.points - wrap, axis=1) <= near) & along
     counted = ~(filled | contact.open)
     back = Surface(wrap, triangles).closest(surface.vertices)
     under = np.linalg.norm(back.points - surface.vertices, axis=1) <= near
     corners = triangles[back.faces]
     part = place[np.take_along_axis(corners, back.shares.argmax(1)[:, None], 1)[:, 0]]
-    seen = ~filled[corners].any(1)
+    # What lies within the wrap is no skin: teeth, eyeballs, the ends of limbs that are set into a trunk.
+    within = ((surface.vertices - back.points) * back.normals).sum(1) < 0
+    seen = ~filled[corners].any(1) & (under | ~within)
     return {
         name: Share(wrap=_mean(on[counted & (place == i)]), native=_mean(under[seen & (part == i)]))
         for i, name in enumerate(names)

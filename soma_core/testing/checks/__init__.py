@@ -27,8 +27,8 @@ CORE_CHECKS: tuple[Check, ...] = (
     *behaviour.CHECKS,
     *parameters.CHECKS,
     *agreement.CHECKS,
-    *capabilities.CHECKS,
     *body.CHECKS,
+    *capabilities.CHECKS,
     *transfer.CHECKS,
     *skeleton.CHECKS,
 )

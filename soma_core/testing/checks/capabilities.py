@@ -75,7 +75,7 @@ def _distance(context: Context, where: str, found: Tensor, expected: Tensor, fix
 @check(
     "triangles",
     level="core",
-    needs=("finite",),
+    needs=("finite", "upright"),
     unless=_lacks(HasTriangles, "triangles"),
     mend="return vertex ids (t, 3), counter-clockwise from outside",
 )
@@ -214,7 +214,7 @@ def random_poses(context: Context) -> None:
 
 @check(
     "pose-vector",
-    needs=("posed",),
+    needs=("posed", "upright"),
     unless=_lacks(HasPoseVector, "pose vector"),
     mend="`heading` turns the body about the vertical, in radians; `own_arrays` has a row a frame",
 )
