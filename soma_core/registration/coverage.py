@@ -94,7 +94,7 @@ def coverage(
     near = max(_NEAR * np.linalg.norm(np.ptp(wrap, axis=0)), float(np.median(sides)) / 2)
     names, place = _segments(rig)
     contact = surface.closest(wrap)
-    # Toes lie folded on a foot or a shoe without any, which sees both sides of them; `matches` tells toes apart.
+    # Toes lie folded on a foot or a shoe without any, seen from both sides; `matches` tells them apart.
     feet = np.array([name.endswith("Foot") for name in names])[place]
     along = ((contact.normals * vertex_normals(wrap, triangles)).sum(1) > 0) | feet
     on = (np.linalg.norm(contact.points - wrap, axis=1) <= near) & along

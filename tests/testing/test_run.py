@@ -26,8 +26,8 @@ IDS = [
     "generator-dtype", "generator-device", "other-device", "finite", "deterministic", "batch-invariant",
     "inputs-unchanged",
     "no-global-state", "no-own-gradient", "parameters", "group-defaults", "gradient", "neutral-equals-obj",
-    "linear-basis", "upright", "stature", "triangles", "skinning", "posed", "random-poses", "pose-vector", "expressions",
-    "motion-formats",
+    "linear-basis", "upright", "stature", "triangles", "skinning", "posed", "random-poses", "pose-vector",
+    "expressions", "motion-formats",
     "transfer-neutral", "transfer-random", "similarity-equivariant", "joints-inside",
     "rotations-so3", "zero-is-t-pose", "inversion-round-trip",
 ]  # fmt: skip
