@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -43,19 +43,20 @@ def _unlisted(root: Path, listed: set[str]) -> list[str]:
     ]
 
 
-def _contents(root: Path) -> list[str]:
-    """Open what the hashes cannot vouch for when the manifest itself is wrong: keys, rig, shapes."""
+def _contents(root: Path, *, whole: bool = True) -> list[str]:
+    """Open what no hash vouches for: keys, rig, shapes. Folders of the user's need no extra-low mesh."""
     from soma_core.rig.canonical import load_canonical
     from soma_core.rig.neutral import load_shape_space
 
-    findings = []
-    for check in (
+    checks: list[Callable[[], object]] = [
         lambda: load_canonical("mid", root),
         lambda: load_canonical("low", root),
-        lambda: load_canonical("xlo", root),
-        lambda: load_shape_space(root / NEUTRAL_NAME),
         lambda: _correctives(root),
-    ):
+    ]
+    if whole:
+        checks += [lambda: load_canonical("xlo", root), lambda: load_shape_space(root / NEUTRAL_NAME)]
+    findings = []
+    for check in checks:
         try:
             check()
         except AssetError as error:
@@ -89,7 +90,7 @@ def verify_assets(root: Path | None = None) -> list[str]:
     manifest = read_manifest(root)
     findings = check_files(root, manifest)
     if not manifest.listed:
-        findings += _readable(root)
+        findings += _contents(root, whole=False)
         if findings:
             raise AssetError(root, cause="; ".join(findings), fix=f"See `soma assets show {root}`")
         return sorted(manifest.files)
@@ -104,23 +105,6 @@ def verify_assets(root: Path | None = None) -> list[str]:
         cause = f"{len(findings)} finding{'s' if len(findings) > 1 else ''}\n  " + "\n  ".join(findings)
         raise AssetError(root, cause=cause, fix="Restore the files above")
     return sorted(manifest.files)
-
-
-def _readable(root: Path) -> list[str]:
-    """What cannot be read of a folder that no manifest describes."""
-    from soma_core.rig.canonical import load_canonical
-
-    findings = []
-    for check in (
-        lambda: load_canonical("mid", root),
-        lambda: load_canonical("low", root),
-        lambda: _correctives(root),
-    ):
-        try:
-            check()
-        except AssetError as error:
-            findings.append(str(error))
-    return findings
 
 
 def use_assets(folder: str) -> str:
