@@ -141,7 +141,7 @@ def read_landmarks(name: str | Path) -> dict[int, int]:
     unknown = [key for key in found if key not in names and not key.isdecimal()]
     if unknown:
         raise InputError(
-            "landmarks",
+            f"landmarks {name}",
             got=unknown[0],
             expected="a canonical vertex id or a name that soma assets landmarks lists",
             fix=did_you_mean(unknown[0], list(names)) or "Correct the name.",
