@@ -11,6 +11,7 @@ __all__ = [
     "split_polygons",
     "triangle_sides",
     "unique_edges",
+    "vertex_areas",
     "vertex_normals",
 ]
 
@@ -65,13 +66,18 @@ def unique_edges(sides: np.ndarray) -> np.ndarray:
     return np.stack([keys >> 32, keys & 0xFFFFFFFF], 1)
 
 
-def vertex_normals(vertices: np.ndarray, triangles: np.ndarray) -> np.ndarray:
-    """Area-weighted unit vertex normals, (v, 3); +Y where a vertex has no area."""
+def vertex_areas(vertices: np.ndarray, triangles: np.ndarray) -> np.ndarray:
+    """Sums of the area vectors of the faces around each vertex (cross products, twice an area), (v, 3)."""
     corners = vertices[triangles]
     faces = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     ids = triangles.reshape(-1)
     weights = np.repeat(faces, 3, axis=0)
-    normals = np.stack([np.bincount(ids, weights[:, axis], len(vertices)) for axis in range(3)], axis=1)
+    return np.stack([np.bincount(ids, weights[:, axis], len(vertices)) for axis in range(3)], axis=1)
+
+
+def vertex_normals(vertices: np.ndarray, triangles: np.ndarray) -> np.ndarray:
+    """Area-weighted unit vertex normals, (v, 3); +Y where a vertex has no area."""
+    normals = vertex_areas(vertices, triangles)
     length = np.linalg.norm(normals, axis=1, keepdims=True)
     return np.where(length > 0, normals / np.where(length > 0, length, 1), (0.0, 1.0, 0.0))
 

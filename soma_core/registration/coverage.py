@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from soma_core.geometry.mesh import triangle_sides, vertex_normals
+from soma_core.geometry.mesh import triangle_sides, vertex_areas, vertex_normals
 from soma_core.registration.digits import DIGITS, LIMBS, DigitGuide, Digits
 from soma_core.registration.surface import Surface
 from soma_core.rig.mesh import CanonicalMesh
@@ -96,9 +96,13 @@ def coverage(
     contact = surface.closest(wrap)
     # Toes lie folded on a foot or a shoe without any, seen from both sides; `matches` tells them apart.
     feet = np.array([name.endswith("Foot") for name in names])[place]
-    along = ((contact.normals * vertex_normals(wrap, triangles)).sum(1) > 0) | feet
-    on = (np.linalg.norm(contact.points - wrap, axis=1) <= near) & along
-    counted = ~(filled | contact.open)
+    # What lies within a closed mouth is no skin, and a native face may be covered by folds: eyelids, lips.
+    inside = filled.copy()
+    inside[mesh.face_interior] = True
+    sense = (vertex_areas(wrap, triangles) * surface.face_normals[contact.faces]).sum(1)
+    turned = np.bincount(contact.faces, np.where(inside, 0, sense), len(surface.triangles)) >= 0
+    on = (np.linalg.norm(contact.points - wrap, axis=1) <= near) & (turned[contact.faces] | feet)
+    counted = ~(inside | contact.open)
     back = Surface(wrap, triangles).closest(surface.vertices)
     under = np.linalg.norm(back.points - surface.vertices, axis=1) <= near
     corners = triangles[back.faces]

@@ -269,7 +269,7 @@ def test_the_last_line_is_where_the_pair_is(tmp_path: Path, body: Path, seen, mo
 
 def test_an_unknown_landmark_is_refused(tmp_path: Path, body: Path, seen) -> None:
     (tmp_path / "marks.json").write_text('{"LeftIndexTop": 34}', encoding="utf-8")
-    with pytest.raises(InputError, match="landmarks: got LeftIndexTop, expected .*LeftIndexTip"):
+    with pytest.raises(InputError, match="landmarks .*marks.json: got LeftIndexTop, expected .*LeftIndexTip"):
         wrap.run(configured(native=str(body), landmarks=str(tmp_path / "marks.json")), tmp_path)
 
 
