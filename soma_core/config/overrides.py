@@ -29,12 +29,13 @@ _MULTIRUN = ("--multirun", "-m")
 
 
 def literal_texts(overrides: Sequence[str], schema: type) -> list[str]:
-    """Quote the values of settings that are texts, so that hydra takes them literally.
+    """Quote the values of settings that are texts, so that hydra takes them literally, and a list of one.
 
     To hydra's grammar brackets, commas, quotes, blanks, ``=``, ``#``, ``$`` and letters beyond ASCII mean
     something else, or nothing; file names hold them all. Left to hydra are ``null``, a value in quotes,
     ``${...}`` of a setting or a resolver, and with ``--multirun`` sweeps: commas then part values, and so do
-    hydra's functions. A file or folder of that very name comes before each of these.
+    hydra's functions. A file or folder of that very name comes before each of these. Where a list is wanted,
+    ``write=npz`` is ``write=[npz]``.
 
     Args:
         overrides: of the command line, flags among them.
@@ -61,8 +62,11 @@ class _Line:
         if found is None or kind is None or found["value"].lower() == "null":
             return override
         key, value = found["key"], found["value"]
+        listed = value.startswith("[") and value.endswith("]")
+        if kind is tuple:
+            alone = not listed and not self.sweeps and not self.resolved.search(value)
+            return f"{key}=[{value}]" if alone else override
         if kind is list:
-            listed = value.startswith("[") and value.endswith("]")
             return f"{key}=[{self.parts(value[1:-1]) if listed else self.quoted(value)}]"
         if not self.sweeps or _exists(value):
             return f"{key}={self.quoted(value)}"
@@ -102,15 +106,15 @@ def _split(value: str) -> Iterator[str]:
 
 
 def _texts(schema: type, prefix: str = "") -> Iterator[tuple[str, type]]:
-    """Full key of each text and each list of texts, and which of the two it is."""
+    """Full key of each text and each list: str, list of texts, or tuple for a list of numbers or choices."""
     hints = get_type_hints(schema)
     for field in dataclasses.fields(schema):
         hint, key = hints[field.name], prefix + field.name
         for kind in get_args(hint) if get_origin(hint) in (Union, UnionType) else (hint,):
             if kind in (str, Path):
                 yield key, str
-            elif get_origin(kind) is list and get_args(kind)[0] in (str, Path):
-                yield key, list
+            elif get_origin(kind) is list:
+                yield key, list if get_args(kind)[0] in (str, Path) else tuple
             elif isinstance(kind, type) and dataclasses.is_dataclass(kind):
                 yield from _texts(kind, f"{key}.")
 

@@ -172,8 +172,22 @@ def _refused_value(cause: OmegaConfBaseException) -> InputError:
         name,
         got="an unknown key",
         expected=f"one of {', '.join(shown) or 'no keys'}" + (f" in {parent}" if parent else ""),
-        fix=did_you_mean(key, known) or "See --help",
+        fix=_elsewhere(key, cause.parent_node) or did_you_mean(key, known) or "See --help",
     )
+
+
+def _elsewhere(key: str, config: object, prefix: str = "") -> str:
+    """Name the full key of a setting given without its group: ``backend.params.age`` for ``age``."""
+    if not isinstance(config, DictConfig):
+        return ""
+    for name in (
+        each for each in map(str, config) if each != "hydra" and not OmegaConf.is_missing(config, each)
+    ):
+        if prefix and name == key:
+            return f'Did you mean "{prefix}{name}"?'
+        if found := _elsewhere(key, config[name], f"{prefix}{name}."):
+            return found
+    return ""
 
 
 def _wrong_type(name: str, text: str) -> InputError:

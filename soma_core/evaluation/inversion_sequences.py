@@ -77,7 +77,7 @@ def own_meshes(count: int, seed: int, make: LayerMaker) -> Iterator[MovingMesh]:
 def _smooth(anny: SomaLayer, native: SomaLayer, count: int, seed: int) -> Iterator[MovingMesh]:
     """A man of Anny and a random native body, each in a smooth random motion."""
     random = np.random.default_rng([seed, 1])
-    shape = {"shape": random.standard_normal(16).tolist()}
+    shape = {"shape": random.standard_normal(16)[: native.spec.params[0].shape[0]].tolist()}
     for layer, params in ((anny, ANNY_IDENTITIES["man"]), (native, shape)):
         turns = smooth_axis_angles(joint_spread(layer.joint_names), count, random)
         drift = np.cumsum(_STEP * random.standard_normal((count, 3)), axis=0) + _HIPS

@@ -226,7 +226,7 @@ def own_fit(
 ) -> Fit:
     """Pose a body by rotation vectors (F, J, 3) [rad] and fit it again."""
     layer = inversion.layer
-    identity = layer.identity(body.params)
+    identity = body.identity(layer)
     rotations = rotation_matrices(vectors, layer)
     hips = drifting_hips(len(vectors), random, layer)
     return fit_frames(inversion, posed_vertices(layer, identity, rotations, hips), identity, rotations)

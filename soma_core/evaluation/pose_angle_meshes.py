@@ -13,7 +13,7 @@ from torch import Tensor
 from soma_core.evaluation.random_poses import joint_spread, smooth_axis_angles
 from soma_core.geometry.rotations import axis_angle_to_matrix
 from soma_core.inversion.priors import HINGES
-from soma_core.layer import SomaLayer
+from soma_core.layer import Identity, SomaLayer
 from soma_core.rig.skeleton import Rig
 
 __all__ = [
@@ -42,6 +42,14 @@ class TestBody:
     name: str
     backend: str
     params: Mapping[str, Any]
+
+    def identity(self, layer: SomaLayer) -> Identity:
+        """It in a layer of its backend; a shape space with fewer components takes the leading ones."""
+        widths = {each.name: each.shape[0] for each in layer.spec.params if each.shape}
+        cut = {
+            name: value[: widths[name]] if name in widths else value for name, value in self.params.items()
+        }
+        return layer.identity(cut)
 
 
 ANNY_BODIES: dict[str, dict[str, float]] = {

@@ -61,7 +61,7 @@ class _Motion:
     @staticmethod
     def of(body: TestBody, inversion: PoseInversion, count: int, random: np.random.Generator) -> _Motion:
         layer = inversion.layer
-        identity = layer.identity(body.params)
+        identity = body.identity(layer)
         rotations = rotation_matrices(smooth_poses(layer, count, random), layer)
         vertices = posed_vertices(layer, identity, rotations, drifting_hips(count, random, layer))
         return _Motion(inversion=inversion, identity=identity, rotations=rotations, vertices=vertices)

@@ -18,6 +18,7 @@ from scipy.sparse.csgraph import connected_components, dijkstra
 from scipy.spatial import cKDTree
 
 from soma_core.geometry.mesh import triangle_sides, unique_edges
+from soma_core.paths import shipped_assets
 from soma_core.registration.surface import Surface
 from soma_core.rig import load_canonical
 
@@ -125,7 +126,7 @@ class DigitGuide:
     """The canonical mesh's own digits, and those of any surface that the mesh lies near."""
 
     def __init__(self) -> None:
-        mesh, rig = load_canonical("mid")
+        mesh, rig = load_canonical("mid", shipped_assets())
         self.mesh = mesh
         weights = rig.weights.toarray()
         share = {name: weights[:, place] for place, name in enumerate(rig.joint_names)}

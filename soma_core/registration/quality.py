@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from soma_core.paths import shipped_assets
 from soma_core.registration.coverage import Share, coverage, faults, matches
 from soma_core.registration.digits import digit_guide
 from soma_core.registration.folds import flipped_triangles
@@ -78,7 +79,7 @@ def measure(found: Registration, mesh: CanonicalMesh) -> Quality:
     contact = surface.closest(wrap)
     distance = 1000 * np.linalg.norm(contact.points - wrap, axis=1)
     own = Surface(wrap, triangles)
-    guide, (_, rig) = digit_guide(), load_canonical("mid")
+    guide, (_, rig) = digit_guide(), load_canonical("mid", shipped_assets())
     digits = guide.find(surface, wrap)
     covered = coverage(wrap, surface, mesh, rig, found.filled)
     matched = matches(wrap, surface, digits, guide)

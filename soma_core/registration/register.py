@@ -14,6 +14,7 @@ from scipy.sparse.linalg import splu
 from soma_core.errors import InputError
 from soma_core.geometry.mesh import vertex_normals
 from soma_core.layer import SomaLayer
+from soma_core.paths import shipped_assets
 from soma_core.plugin.spec import Axis, Unit
 from soma_core.progress import progress
 from soma_core.registration.alignment import find_starts
@@ -140,7 +141,11 @@ def register(
     """
     options = options or WrapOptions()
     skin = find_skin(vertices, triangles, masked=options.masked)
-    coarse, fine = (BodyModel(SomaLayer("soma", lod=lod, procedural=False)) for lod in ("low", "mid"))
+    # The shipped body, whatever folder is in use: its shape space is known to fit, and the mesh is the same.
+    coarse, fine = (
+        BodyModel(SomaLayer("soma", lod=lod, procedural=False, assets=shipped_assets()))
+        for lod in ("low", "mid")
+    )
     marks = _landmarks(options, vertices, fine.mesh.vertex_count)
     filled = _filled(options.fill, fine.mesh)
     light = skin.lighter()

@@ -12,7 +12,7 @@ from omegaconf import OmegaConf
 from soma_core.errors import AssetError, InputError, SomaError
 from soma_core.json_file import read_json
 from soma_core.options import BackendChoice
-from soma_core.paths import expanded
+from soma_core.paths import expanded, shipped_assets
 from soma_core.plugin.declaration import did_you_mean
 from soma_core.plugin.registry import default_registry
 from soma_core.plugin.spec import WrapPair
@@ -40,7 +40,7 @@ def run(config: DictConfig, output: Path) -> Path:
         SomaError: the mesh cannot be read, is broken, or shows no human body; or a part of it is not covered,
             or a finger lies on another one, once all is written.
     """
-    mesh, _ = load_canonical("mid")
+    mesh, _ = load_canonical("mid", shipped_assets())
     folder = expanded(config.out) if config.out else output
     if folder.exists() and not folder.is_dir():
         raise InputError(

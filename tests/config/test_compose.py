@@ -114,6 +114,8 @@ def test_strict_lets_the_error_of_a_task_through(run: Run, monkeypatch: pytest.M
             "backend.params.shap: got an unknown key, expected one of shape in backend.params. "
             'Did you mean "shape"?',
         ),
+        ("width=3", 'Did you mean "picture.width"?'),
+        ("shape=[1]", 'Did you mean "backend.params.shape"?'),
         ("bakend=soma", "bakend: got an unknown key, expected one of backend, backends, motion"),
         ("lod=big", "lod: got invalid value 'big', expected one of [mid, low, xlo]"),
         ("write=[npz,uds]", "write[1]: got invalid value 'uds', expected one of [npz, usd, glb, html, png,"),
