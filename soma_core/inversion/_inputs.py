@@ -69,13 +69,13 @@ def refuse_unit_error(scale: Tensor, name: str = "vertices") -> None:
     typical = float(scale.median())
     for factor in _UNIT_FACTORS:
         if 0.5 < typical / factor < 2:
-            points = name == "points"
+            canonical = name == "vertices"
             raise InputError(
                 name,
                 got=f"bodies {typical:.4g} times the size of their identity",
-                expected="metres"
-                if points
-                else "metres on the canonical topology, or the backend's own unit",
+                expected="metres on the canonical topology, or the backend's own unit"
+                if canonical
+                else "metres",
                 fix=f"Multiply the {name} by {1 / factor:g}.",
             )
 

@@ -19,7 +19,7 @@ from soma_core.inversion.problem import Pose, part_of
 from soma_core.inversion.result import InversionResult
 from soma_core.skeleton.identity import Identity
 
-__all__ = ["PointFit", "PointResult"]
+__all__ = ["FEWEST", "HIPS_PACE", "PointFit", "PointResult", "bridged", "determined"]
 
 _CHUNK = 2048
 """Frames fitted at a time."""
@@ -39,13 +39,13 @@ _LEAST_CLAIM = 5e-4
 _STILL = 0.02
 """A frame rests when a step changes the root mean square error by less than this share of the noise."""
 
-_HIPS_PACE = 5.0
+HIPS_PACE = 5.0
 """Usual acceleration of the Hips [m/s^2]."""
 
 _ROUNDING = 1e-6
 """Relative to the matrix of the points: what is less is not told from nothing."""
 
-_FEWEST = 3
+FEWEST = 3
 """A frame with fewer known points is not fitted."""
 
 _CORRECTIONS = 3
@@ -113,7 +113,7 @@ class PointFit:
         self.weights, self.rest = weights, model.rest(identity, bone_scale)
         self.given, self.iterations = noise, iterations
         self.every = every = weights.expand(len(points), -1)
-        self.valid = (every > 0).sum(1) >= _FEWEST
+        self.valid = (every > 0).sum(1) >= FEWEST
         total = every.sum(1, keepdim=True).clamp_min(1e-12)
         self.origin = (every[..., None] * points).sum(1) / total
         self.points = (points - self.origin[:, None]) * (every > 0)[..., None]
@@ -136,13 +136,13 @@ class PointFit:
             return rest
         return PointRest(local=rest.local[part], offsets=rest.offsets[part])
 
-    def begin(self, initial: InversionResult | None) -> None:
-        """Start from the points, or from an earlier result."""
+    def begin(self, initial: InversionResult | None, *, named: str = "points") -> None:
+        """Start from the points, or from an earlier result; `named` is what is in another unit, if so."""
         begun = [self.start(one.rest, one.points, one.weights) for one in self.chunks()]
         relative, hips, scale = (torch.cat(parts) for parts in zip(*begun, strict=True))
         scale = scale[torch.isfinite(scale)]
         if len(scale):
-            refuse_unit_error(scale, "points")
+            refuse_unit_error(scale, named)
         if initial is not None:
             still = torch.eye(3).to(self.points).expand(len(self.points), 1, 3, 3)
             relative = torch.cat((still, initial.rotations.to(self.points)), 1)
@@ -168,26 +168,12 @@ class PointFit:
         if len(pose.translation) < 3:
             return
         targets = self.points - self.shift + self.origin[:, None]
-        pace = torch.cat((model.pace[model.solver.variables], model.pace.new_tensor([_HIPS_PACE])))
+        pace = torch.cat((model.pace[model.solver.variables], model.pace.new_tensor([HIPS_PACE])))
         rows = rows_of(targets, self.weights, max(self.noise, _FIRST_NOISE))
         solve = PointRows(model, self.rest, rows, smooth=pace / fps**2)
-        found = solve(self._bridged(replace(pose, translation=pose.translation + self.origin)))
+        found = solve(bridged(replace(pose, translation=pose.translation + self.origin), self.valid))
         self.pose = replace(found, translation=found.translation - self.origin)
         self.bridged = self.bridged | bool(self.valid.any())
-
-    def _bridged(self, pose: Pose) -> Pose:
-        """The pose in the world, frames that could not be fitted between those before and after them."""
-        good = torch.nonzero(self.valid).flatten()
-        if len(good) in (0, len(self.valid)):
-            return pose
-        at = torch.arange(len(self.valid), device=good.device)
-        after = torch.searchsorted(good, at).clamp(max=len(good) - 1)
-        first, last = good[(after - (good[after] > at).long()).clamp_min(0)], good[after]
-        share = ((at - first) / (last - first).clamp_min(1)).clamp(0, 1).to(pose.translation)
-        turn = matrix_to_axis_angle(pose.relative[last] @ pose.relative[first].mT)
-        relative = axis_angle_to_matrix(share[:, None, None] * turn) @ pose.relative[first]
-        hips = torch.lerp(pose.translation[first], pose.translation[last], share[:, None])
-        return replace(pose, relative=relative, translation=hips)
 
     def _sampled(self) -> PointFit:
         """A fit of some of the frames, evenly spaced, in which points have their way."""
@@ -283,14 +269,13 @@ class PointFit:
         residual = ((self.every * error.square()).sum(1) / mass).sqrt()
         eye = torch.eye(3, dtype=error.dtype, device=error.device)
         std = self._angle_std()
-        surely = std < _SURE * self.model.spread[1:]
         posed = valid | self.bridged
         return PointResult(
             rotations=torch.where(posed[:, None, None, None], self.pose.relative, eye)[:, 1:],
             translation=torch.where(posed[:, None], self.pose.translation + self.origin, 0.0),
             vertex_error=error.masked_fill(~(known & valid[:, None]), torch.nan),
             valid=valid,
-            determined=surely & valid[:, None],
+            determined=determined(std, self.model) & valid[:, None],
             converged=(self.pose.last_change < 5 * _STILL * max(self.noise, _FIRST_NOISE)) & valid,
             iterations=self.pose.accepted,
             residual=residual.masked_fill(~valid, torch.nan),
@@ -298,3 +283,23 @@ class PointFit:
             noise=self.noise,
             plain=torch.zeros_like(valid),
         )
+
+
+def determined(std: Tensor, model: PointModel) -> Tensor:
+    """Whether angles (F, J - 1) [degrees] are told by the points, rather than by what is expected."""
+    return std < _SURE * model.spread[1:]
+
+
+def bridged(pose: Pose, known: Tensor) -> Pose:
+    """A pose in the world; frames that are not `known` (F,) between those before and after them."""
+    good = torch.nonzero(known).flatten()
+    if len(good) in (0, len(known)):
+        return pose
+    at = torch.arange(len(known), device=good.device)
+    after = torch.searchsorted(good, at).clamp(max=len(good) - 1)
+    first, last = good[(after - (good[after] > at).long()).clamp_min(0)], good[after]
+    share = ((at - first) / (last - first).clamp_min(1)).clamp(0, 1).to(pose.translation)
+    turn = matrix_to_axis_angle(pose.relative[last] @ pose.relative[first].mT)
+    relative = axis_angle_to_matrix(share[:, None, None] * turn) @ pose.relative[first]
+    hips = torch.lerp(pose.translation[first], pose.translation[last], share[:, None])
+    return replace(pose, relative=relative, translation=hips)

@@ -29,6 +29,9 @@ _WINDOW, _OVERLAP = 240, 24
 _STEPS = 12
 """Largest number of steps; a step that does not help is damped."""
 
+_RIDGE = 1e-9
+"""Relative to the diagonal: keeps what nothing holds finite."""
+
 _RESTING = 1e-4
 """Relative change of the energy at which steps end."""
 
@@ -97,6 +100,31 @@ class PointRows:
             if not bool(better.any()) and float(damping.min()) > 1e4:
                 break
         return pose
+
+    def energy(self, pose: Pose) -> Tensor:
+        """What is minimised, (F,), or (1,) of all frames together."""
+        return self._system(pose, slice(0, len(pose.translation)))[0]
+
+    def _inverse(self, pose: Pose) -> tuple[Tensor, Tensor]:
+        """Matrix (F, d, d) of each frame on its own, and its inverse, float64."""
+        matrix = self._system(pose, slice(0, len(pose.translation)))[1][0].double()
+        diagonal = matrix.diagonal(dim1=-2, dim2=-1)
+        ridge = _RIDGE * (diagonal + diagonal.mean(1, keepdim=True))
+        factor, _ = torch.linalg.cholesky_ex(matrix + torch.diag_embed(ridge))
+        return matrix, torch.cholesky_inverse(factor)
+
+    def angle_std(self, pose: Pose) -> Tensor:
+        """Standard deviation (F, n) [degrees] of each variable's turn, by its own frame alone."""
+        own = self._inverse(pose)[1].diagonal(dim1=-2, dim2=-1)[:, :-3]
+        return own.unflatten(1, (-1, 3)).sum(-1).clamp_min(0).sqrt().rad2deg()
+
+    def taken(self, pose: Pose) -> Tensor:
+        """Degrees of freedom (F,) of each frame on its own that its rows take up."""
+        inverse = self._inverse(pose)[1]
+        zero = torch.zeros_like(pose.relative[:, 0, 0, 0])
+        expected = torch.zeros_like(inverse)
+        self._expected(pose, expected, zero[:, None].repeat(1, self.size).double())
+        return self.size - (inverse * expected).sum((1, 2))
 
     @staticmethod
     def _chosen(better: Tensor, trial: Pose, pose: Pose) -> Pose:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -16,7 +17,10 @@ from soma_core.inversion.point_fit import PointFit, PointResult
 from soma_core.inversion.point_model import PointModel
 from soma_core.inversion.point_priors import JointPrior
 from soma_core.inversion.point_start import PointStart
+from soma_core.inversion.point_views import Views
 from soma_core.inversion.result import InversionResult
+from soma_core.inversion.view_fit import ViewFit
+from soma_core.io.camera import Camera
 from soma_core.layer import Kernels, SomaLayer
 from soma_core.points.places import PointPlaces
 from soma_core.points.point_set import PointSet, load_point_set
@@ -40,7 +44,8 @@ class PointInversion(Derived):
         layer: makes identities and poses them.
         points: a point set, its name (``soma points list``) or its file.
         prior: what is known of the joints.
-        noise: standard deviation of a coordinate [m]; None estimates one for all frames of a call.
+        noise: standard deviation of a coordinate [m], of points in pictures [px]; None estimates one for all
+            frames of a call.
         iterations: largest number of steps of each look.
         kernels: ``torch`` (the reference), ``warp`` or ``auto``.
 
@@ -94,17 +99,22 @@ class PointInversion(Derived):
         bone_scale: Tensor | None = None,
         initial: InversionResult | None = None,
         fps: float | None = None,
+        cameras: Camera | Sequence[Camera] | None = None,
     ) -> PointResult:
         """Fit every frame, on its own unless `fps` is given.
 
         Args:
-            points: (F, P, 3) [m], +Y up, in the order of the point set; NaN where a point is not known.
+            points: (F, P, 3) [m], +Y up, in the order of the point set; NaN where a point is not known. With
+                `cameras` (F, P, 2) [px], or (V, F, P, 2) of several.
             identity: batch of 1, shared by all frames, or of F.
             weights: (P,) or (F, P), relative inverse variances such as a detector's confidence; 0 leaves out.
+                With several cameras also (V, F, P).
             bone_scale: (1 or F, J - 1) known factors of the bone vectors, as in ``SomaLayer.pose``.
             initial: an earlier result for these frames, to begin from.
             fps: frames per second of one motion: joints then turn at their usual pace, and frames with too
                 few points, which are not `valid`, are bridged. None for frames that are apart.
+            cameras: that see the points, one or V. `noise`, ``point_error`` (the mean over the views) and
+                ``residual`` are then in pixels, and the size of the body has to be known for one view.
 
         Raises:
             InputError: a wrong shape, a negative weight, points in another unit than they should be.
@@ -114,6 +124,9 @@ class PointInversion(Derived):
         if (layer.device, layer.dtype) != (self.device, self.dtype):
             self._build(layer.device, layer.dtype)
         layer.check_identity(identity)
+        if cameras is not None:
+            given = (cameras,) if isinstance(cameras, Camera) else tuple(cameras)
+            return self._of_views(points, identity, weights, bone_scale, initial, fps, given)
         points = self._checked(points)
         count = len(points)
         weights = check_weights(weights, points.new_ones(points.shape[1]), count)
@@ -135,6 +148,48 @@ class PointInversion(Derived):
 
     if TYPE_CHECKING:  # torch says that a module returns anything
         __call__ = forward
+
+    def _of_views(
+        self,
+        pixels: Tensor,
+        identity: Identity,
+        weights: Tensor | None,
+        bone_scale: Tensor | None,
+        initial: InversionResult | None,
+        fps: float | None,
+        cameras: tuple[Camera, ...],
+    ) -> PointResult:
+        """:meth:`forward` of points in pictures."""
+        layer, wanted = self.layer, len(self.points)
+        pixels = self._floating(pixels)
+        pixels = pixels[None] if pixels.ndim == 3 else pixels
+        if pixels.ndim != 4 or pixels.shape[0] != len(cameras) or tuple(pixels.shape[2:]) != (wanted, 2):
+            raise InputError(
+                "points", got=tuple(pixels.shape),
+                expected=f"({len(cameras)}, frames, {wanted}, 2): pixels of {self.points.name} for each camera",
+                fix="Give as many cameras as views, and the points in the order of soma points show.",
+            )  # fmt: skip
+        count = pixels.shape[1]
+        for camera in cameras:
+            if len(camera.extrinsics) not in (1, count):
+                raise InputError(
+                    "camera", got=f"extrinsics of {len(camera.extrinsics)} frames",
+                    expected=f"one, or one for each of the {count} frames",
+                    fix="Give one matrix for a camera that stands.",
+                )  # fmt: skip
+        every = [None] * len(cameras) if weights is None else torch.as_tensor(weights)
+        if isinstance(every, Tensor) and every.ndim < 3:
+            every = [every] * len(cameras)
+        plain = pixels.new_ones(wanted)
+        known = torch.isfinite(pixels).all(-1)
+        own = torch.stack([check_weights(one, plain, count).expand(count, -1) for one in every]) * known
+        bone_scale = check_bone_scale(bone_scale, count, len(layer.joint_names), layer.dtype, layer.device)
+        with torch.no_grad():
+            views = Views.of(cameras, torch.where(known[..., None], pixels, 0.0), own)
+            fit = ViewFit(self.model, self.start, views, identity, bone_scale, noise=self.noise, fps=fps)
+            fit.begin(initial)
+            fit.run()
+            return fit.result(known)
 
     @own_precision
     def bone_scale(self, points: Tensor, identity: Identity) -> Tensor:
@@ -176,19 +231,23 @@ class PointInversion(Derived):
             self.start(rest, points.nan_to_num(0.0), known.to(points))[2].nanmedian().nan_to_num(1.0)
         )
 
-    def _checked(self, points: object) -> Tensor:
+    def _floating(self, points: object) -> Tensor:
         if not isinstance(points, Tensor) or not points.is_floating_point():
             raise InputError(
                 "points", got=points.dtype if isinstance(points, Tensor) else type(points).__name__,
                 expected="a floating torch.Tensor", fix="Wrap it: torch.as_tensor(points).",
             )  # fmt: skip
-        wanted = len(self.points)
+        return points.to(self.layer.device, self.layer.dtype)
+
+    def _checked(self, points: object) -> Tensor:
+        points, wanted = self._floating(points), len(self.points)
         if points.ndim != 3 or tuple(points.shape[1:]) != (wanted, 3):
             raise InputError(
                 "points", got=tuple(points.shape), expected=f"(frames, {wanted}, 3) of {self.points.name}",
-                fix="Order them as soma points show lists them, or take another point set.",
+                fix="Order them as soma points show lists them, or take another point set; points of a "
+                "picture need cameras=.",
             )  # fmt: skip
-        return points.to(self.layer.device, self.layer.dtype)
+        return points
 
 
 def _sideless(name: str) -> str:
