@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from soma_core.inversion.priors import HINGES, PosePriors
     from soma_core.inversion.result import InversionResult
     from soma_core.io.amass import SmplMotion, write_amass
+    from soma_core.io.camera import Camera, read_camera, read_cameras
     from soma_core.io.clip import SkinnedClip, skinned_clip
     from soma_core.io.gltf import write_gltf
     from soma_core.io.joint_order import USER_JOINTS
@@ -59,6 +60,7 @@ __all__ = [
     "AssetError",
     "AutogradOptions",
     "BackendError",
+    "Camera",
     "CanonicalMesh",
     "Identity",
     "IdentityFit",
@@ -98,6 +100,8 @@ __all__ = [
     "load_shape_space",
     "open_vertex_sequence",
     "read_amass",
+    "read_camera",
+    "read_cameras",
     "read_motion",
     "read_sam3d",
     "read_smpl",
@@ -133,6 +137,7 @@ _HOMES = {
     "soma_core.inversion.point_priors": ["JointPrior", "JointRange"],
     # Named points: keypoints, markers, joints of other rigs
     "soma_core.points.point_set": ["Point", "PointSet", "load_point_set"],
+    "soma_core.io.camera": ["Camera", "read_camera", "read_cameras"],
     # To the meshes and poses of other models
     "soma_core.native.fit": ["NativeFit"],
     "soma_core.native.motion": ["NativeMotion"],

@@ -99,13 +99,15 @@ HEAVY = {"torch", "warp", "pxr", "trimesh"}
 
 PUBLIC_NAMES = {
     "soma_core": """
-        AnalyticalOptions AssetError AutogradOptions BackendError CanonicalMesh HINGES Identity IdentityFit
+        AnalyticalOptions AssetError AutogradOptions BackendError Camera CanonicalMesh HINGES Identity
+        IdentityFit
         InputError InversionResult JointPrior JointRange Motion NativeFit NativeMotion NativeTransfer
         ParameterFit Point PointInversion PointResult PointSet PoseInversion PosePriors
         Posed Rig Sam3dFrames ShapeSpace SkinnedClip SmplChoices SmplMotion SomaError SomaLayer USER_JOINTS
         VertexSequence __version__ assets_dir canonical_landmarks default_registry diagnose_fit fit_identity
         load_canonical load_point_set load_shape_space
-        open_vertex_sequence read_amass read_motion read_sam3d read_smpl skinned_clip write_amass write_gltf
+        open_vertex_sequence read_amass read_camera read_cameras read_motion read_sam3d read_smpl
+        skinned_clip write_amass write_gltf
         write_motion write_usd
     """,
     "soma_core.motion": """

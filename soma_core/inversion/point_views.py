@@ -1,4 +1,4 @@
-"""Points in pictures: what calibrated cameras see of them, as rows of the solver, rays and triangulated places."""
+"""Points in pictures of calibrated cameras: rows of the solver, where rays meet, and noise."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _NEAREST = 0.05
 """Depth [m] that points in front of a camera have at least, while a fit is under way."""
 
 _LEAST_NOISE, _USUAL_NOISE = 5e-4, 5e-3
-"""Noise of a coordinate beside the extent of a person in the picture: its least, and where nothing tells it."""
+"""Noise of a coordinate beside the extent of a person in a picture: its least, and where nothing tells it."""
 
 _PARALLEL = 1e-3
 """Sine of half the angle of two rays that meet nowhere in particular."""

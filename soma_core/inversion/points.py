@@ -125,8 +125,13 @@ class PointInversion(Derived):
             self._build(layer.device, layer.dtype)
         layer.check_identity(identity)
         if cameras is not None:
-            given = (cameras,) if isinstance(cameras, Camera) else tuple(cameras)
-            return self._of_views(points, identity, weights, bone_scale, initial, fps, given)
+            views = self._views(points, (cameras,) if isinstance(cameras, Camera) else cameras, weights)
+            count, joints = views.weights.shape[1], len(layer.joint_names)
+            scale = check_bone_scale(bone_scale, count, joints, layer.dtype, layer.device)
+            with torch.no_grad():
+                return ViewFit(
+                    self.model, self.start, views, identity, scale, noise=self.noise, fps=fps
+                )(initial)  # fmt: skip
         points = self._checked(points)
         count = len(points)
         weights = check_weights(weights, points.new_ones(points.shape[1]), count)
@@ -149,24 +154,14 @@ class PointInversion(Derived):
     if TYPE_CHECKING:  # torch says that a module returns anything
         __call__ = forward
 
-    def _of_views(
-        self,
-        pixels: Tensor,
-        identity: Identity,
-        weights: Tensor | None,
-        bone_scale: Tensor | None,
-        initial: InversionResult | None,
-        fps: float | None,
-        cameras: tuple[Camera, ...],
-    ) -> PointResult:
-        """:meth:`forward` of points in pictures."""
-        layer, wanted = self.layer, len(self.points)
-        pixels = self._floating(pixels)
+    def _views(self, pixels: Tensor, cameras: Sequence[Camera], weights: Tensor | None) -> Views:
+        """Points in pictures, checked."""
+        wanted, pixels = len(self.points), self._floating(pixels)
         pixels = pixels[None] if pixels.ndim == 3 else pixels
-        if pixels.ndim != 4 or pixels.shape[0] != len(cameras) or tuple(pixels.shape[2:]) != (wanted, 2):
+        if pixels.ndim != 4 or len(pixels) != len(cameras) or tuple(pixels.shape[2:]) != (wanted, 2):
             raise InputError(
                 "points", got=tuple(pixels.shape),
-                expected=f"({len(cameras)}, frames, {wanted}, 2): pixels of {self.points.name} for each camera",
+                expected=f"({len(cameras)}, frames, {wanted}, 2): {self.points.name} for each camera",
                 fix="Give as many cameras as views, and the points in the order of soma points show.",
             )  # fmt: skip
         count = pixels.shape[1]
@@ -177,35 +172,36 @@ class PointInversion(Derived):
                     expected=f"one, or one for each of the {count} frames",
                     fix="Give one matrix for a camera that stands.",
                 )  # fmt: skip
-        every = [None] * len(cameras) if weights is None else torch.as_tensor(weights)
-        if isinstance(every, Tensor) and every.ndim < 3:
-            every = [every] * len(cameras)
-        plain = pixels.new_ones(wanted)
-        known = torch.isfinite(pixels).all(-1)
-        own = torch.stack([check_weights(one, plain, count).expand(count, -1) for one in every]) * known
-        bone_scale = check_bone_scale(bone_scale, count, len(layer.joint_names), layer.dtype, layer.device)
-        with torch.no_grad():
-            views = Views.of(cameras, torch.where(known[..., None], pixels, 0.0), own)
-            fit = ViewFit(self.model, self.start, views, identity, bone_scale, noise=self.noise, fps=fps)
-            fit.begin(initial)
-            fit.run()
-            return fit.result(known)
+        each = [weights] * len(cameras)
+        if isinstance(weights, Tensor) and weights.ndim == 3:
+            each = list(weights.expand(len(cameras), -1, -1))
+        plain, known = pixels.new_ones(wanted), torch.isfinite(pixels).all(-1)
+        own = torch.stack([check_weights(one, plain, count).expand(count, -1) for one in each]) * known
+        return Views.of(cameras, torch.where(known[..., None], pixels, 0.0), own)
 
     @own_precision
-    def bone_scale(self, points: Tensor, identity: Identity) -> Tensor:
+    def bone_scale(
+        self, points: Tensor, identity: Identity, *, cameras: Sequence[Camera] | None = None
+    ) -> Tensor:
         """Factors (1, J - 1) of the bone vectors that make a body as long in its parts as one that was seen.
 
         A bone between two joints whose centres are points has the median of its lengths, the same on both
         sides; all others have the factor of the whole body.
 
         Args:
-            points: (F, P, 3) [m] of one person; NaN where a point is not known.
+            points: (F, P, 3) [m] of one person; NaN where a point is not known. With `cameras` (V, F, P, 2)
+                [px] of at least two.
             identity: the body that is scaled, batch of 1.
+            cameras: that see the points.
 
         Raises:
-            InputError: a wrong shape.
+            InputError: a wrong shape; a single camera, which tells no length.
         """
-        points, layer = self._checked(points), self.layer
+        layer = self.layer
+        if cameras is not None:
+            places, met = self._views(points, cameras, None).triangulated()
+            points = torch.where(met[..., None] > 0, places, torch.nan)
+        points = self._checked(points)
         length = layer.animation.bone_vectors(identity).norm(dim=-1)[0]
         centre, parents = self.start.centre, layer.rig.parents
         seen: dict[str, list[float]] = {}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import torch
@@ -14,6 +15,7 @@ from soma_core.inversion.point_rows import PointRows
 from soma_core.inversion.point_start import PointStart
 from soma_core.inversion.point_views import Views
 from soma_core.inversion.problem import Pose, part_of
+from soma_core.inversion.result import InversionResult
 from soma_core.skeleton.identity import Identity
 
 __all__ = ["ViewFit"]
@@ -66,7 +68,13 @@ class ViewFit:
         self.shift = views.rays.new_zeros(*views.rays.shape[1:3], 3)
         self.pose = Pose.begin(model.mean.expand(len(self.shift), -1, 3, 3), self.shift[:, 0])
 
-    def begin(self, initial: PointResult | None) -> None:
+    def __call__(self, initial: InversionResult | None) -> PointResult:
+        """Fit, from an earlier result or from what is seen."""
+        self.begin(initial)
+        self.run()
+        return self.result()
+
+    def begin(self, initial: InversionResult | None) -> None:
         """Start from an earlier result, from where rays meet, or from one view."""
         if not bool(self.valid.any()):
             return
@@ -195,7 +203,7 @@ class ViewFit:
             return self.noise
         misses = views.weights * views.seen(self._points())[0].square().sum(-1)
         energy = float(misses.sum((0, 2))[self.valid].mean())
-        return max((energy / spare) ** 0.5, views.least_noise)
+        return max(math.sqrt(energy / spare), views.least_noise)
 
     def _correct(self) -> None:
         """What twist joints and correctives do to the points, beside plain skinning."""
@@ -210,8 +218,8 @@ class ViewFit:
             points = places(posed.transforms, posed.vertices[:, places.vertex_ids])
             self.shift[part] = points - plain[part]
 
-    def result(self, known: Tensor) -> PointResult:
-        """What the poses are worth; `known` (V, F, P) tells which points are."""
+    def result(self) -> PointResult:
+        """What the poses are worth."""
         valid, views, pose = self.valid, self.views, self.pose
         misses = views.seen(self._points())[0].norm(dim=-1)
         mass = views.weights.sum((0, 2)).clamp_min(1e-12)
@@ -223,7 +231,7 @@ class ViewFit:
         return PointResult(
             rotations=torch.where(posed[:, None, None, None], pose.relative, eye)[:, 1:],
             translation=torch.where(posed[:, None], pose.translation, 0.0),
-            vertex_error=misses.masked_fill(~(known & valid[:, None]), torch.nan).nanmean(0),
+            vertex_error=misses.masked_fill(~((views.weights > 0) & valid[:, None]), torch.nan).nanmean(0),
             valid=valid,
             determined=determined(std[:, 1:], self.model) & valid[:, None],
             converged=valid & torch.isfinite(residual),

@@ -11,7 +11,7 @@ import numpy as np
 from soma_core.errors import AssetError, InputError
 from soma_core.json_file import read_json
 
-__all__ = ["Camera", "read_camera"]
+__all__ = ["Camera", "read_camera", "read_cameras"]
 
 _NEEDED, _SIZE = ("fx", "fy", "cx", "cy", "extrinsics"), ("width", "height")
 _EXAMPLE = '{"fx": 1000, "fy": 1000, "cx": 640, "cy": 360, "extrinsics": [[1,0,0,0],[0,-1,0,1],[0,0,-1,3]]}'
@@ -67,7 +67,22 @@ def read_camera(path: str | Path) -> Camera:
         InputError: a key is missing or strange, or holds what a camera cannot have.
     """
     path = Path(path).expanduser()
-    values = read_json(path, fix=f"Write a camera such as {_EXAMPLE}")
+    return _camera(path, read_json(path, fix=f"Write a camera such as {_EXAMPLE}"))
+
+
+def read_cameras(path: str | Path) -> tuple[Camera, ...]:
+    """Read one camera, or a list of several that see the same.
+
+    Raises:
+        AssetError, InputError: as :func:`read_camera`.
+    """
+    path = Path(path).expanduser()
+    values = read_json(path, fix=f"Write a camera such as {_EXAMPLE}, or a list of them")
+    listed = values if isinstance(values, list) and values else [values]
+    return tuple(_camera(path, one) for one in listed)
+
+
+def _camera(path: Path, values: Any) -> Camera:
     if not isinstance(values, dict):
         raise AssetError(path, cause="no JSON object", fix=f"Write {_EXAMPLE}")
     missing = [key for key in _NEEDED if key not in values]

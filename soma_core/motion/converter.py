@@ -63,14 +63,16 @@ class Converted:
         return self.report.get("error_mm", {}).get("all")
 
     def __str__(self) -> str:
-        settings, error = self.report["settings"], self.error_mm
+        settings, error, unit = self.report["settings"], self.error_mm, "mm"
+        if "error_px" in self.report:
+            error, unit = self.report["error_px"]["all"], "px"
         told = f"{settings['layout']}, {self.report['frames']} frames at {settings['fps']:g} fps"
         earlier = " (by an earlier run)" if self.earlier else ""
         if error is None:
             return f"{told}, {'posed' if self.vertices else 'rotations carried over'}{earlier}"
         if error["mean"] is None:
             return f"{told}, of which none could be used{earlier}"
-        figures = f"mean {error['mean']:.3g}, P95 {error['p95']:.3g}, max {error['max']:.3g} mm"
+        figures = f"mean {error['mean']:.3g}, P95 {error['p95']:.3g}, max {error['max']:.3g} {unit}"
         return f"{told}, fitted with an error of {figures}{earlier}"
 
 

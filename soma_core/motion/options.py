@@ -97,11 +97,13 @@ class FitOptions(ModelOptions, SourceOptions):
         lod: of the fit.
         chunk: frames in memory at once; finished chunks are kept until the end.
         picture: the worst frames, coloured by their error.
+        camera: JSON file of the camera, or of a list of cameras, in whose pictures `points` are.
     """
 
     lod: FitLod = FitLod.mid  # type: ignore[assignment]  # a part of the model's choice
     chunk: int = 256
     picture: Picture = field(default_factory=lambda: Picture(frames=0))
+    camera: str | None = None
 
     def __post_init__(self) -> None:
         """Refuse a chunk of no frames, and two names of an axis that differ."""
@@ -111,6 +113,9 @@ class FitOptions(ModelOptions, SourceOptions):
                 "axes", got=f"{self.axes} beside up={self.up}", expected="one of the two",
                 fix="A camera's axes have up=-y.",
             )  # fmt: skip
+        if self.camera is not None and self.points is None and not isinstance(self, WriteOptions):
+            fix = "Pass points=NAME, such as coco17."
+            raise InputError("camera", got=self.camera, expected="none without points", fix=fix)
         if self.chunk < 1:
             raise InputError("chunk", got=self.chunk, expected="at least 1", fix="Try chunk=256.")
 
@@ -244,7 +249,8 @@ class ConvertOptions(WriteOptions, FitOptions):
             InputError: the first one.
         """
         if self.to == "soma":
-            self.refuse_unused(self.write or [Product.npz])
+            used = () if self.points is None else ("camera",)
+            self.refuse_unused(self.write or [Product.npz], used)
             return
         strange = [product for product in self.shown if product not in MESH_WRITERS]
         mixed = self.shown and (Product.npz in (self.write or []) or self.result == "poses")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -11,6 +12,7 @@ import torch
 
 from soma_core.errors import InputError
 from soma_core.inversion.points import PointInversion
+from soma_core.io.camera import Camera, read_cameras
 from soma_core.io.motion import Motion
 from soma_core.io.point_files import PointFrames, read_points
 from soma_core.motion.models import open_layer
@@ -30,6 +32,9 @@ _log = logging.getLogger(__name__)
 
 _SIZES = (0.6, 1.5)
 """A person this much smaller or larger than the body is said; a newborn has 0.3 of an adult."""
+
+_MISSED, _MISSED_SHARE = 0.05, 0.03
+"""Errors that are said: [m], or beside the size of the person in the picture."""
 
 
 class Pointed:
@@ -52,7 +57,8 @@ def from_points(path: Path, options: FitOptions, *, person: str | None = None) -
     """
     assert options.points is not None
     points = load_point_set(options.points)
-    found = read_points(path, points.names, person=person)
+    cameras = () if options.camera is None else _cameras(options)
+    found = read_points(path, points.names, person=person, views=len(cameras))
     fps = options.fps or found.fps
     if fps is None:
         raise InputError(
@@ -65,10 +71,14 @@ def from_points(path: Path, options: FitOptions, *, person: str | None = None) -
     places, scale = _in_metres(path, found, options)
     inversion = PointInversion(layer, points)
     identity = layer.identity(dict(options.backend.params) if options.backend is not None else {})
-    lengths = inversion.bone_scale(places, identity)
+    lengths = None
+    if len(cameras) != 1:
+        lengths = inversion.bone_scale(places, identity, cameras=cameras or None)
     weights = None if found.confidence is None else torch.as_tensor(found.confidence).to(places)
     try:
-        result = inversion(places, identity, weights=weights, bone_scale=lengths, fps=fps)
+        result = inversion(
+            places, identity, weights=weights, bone_scale=lengths, fps=fps, cameras=cameras or None
+        )
     except InputError as error:
         if error.argument == "points" and "Multiply" in error.fix:
             raise _unit_error(path, error, scale) from error
@@ -80,18 +90,41 @@ def from_points(path: Path, options: FitOptions, *, person: str | None = None) -
         )  # fmt: skip
     motion = _motion(path, layer, result, lengths, fps)
     names = Names(ups=tuple(SIGNED) if options.upward is None else ())
-    said = [*of_motion(motion, names), *_doubts(result, lengths)]
-    say(path.name, said)
+    extent = None if not cameras else _extent(found.positions)
+    say(path.name, [*of_motion(motion, names), *_doubts(result, lengths, extent)])
     report = _report(points.name, found, result, lengths, motion)
+    noise = f"{1e3 * result.noise:.1f} mm" if extent is None else f"{result.noise:.1f} px"
     _log.info(
-        "%s: %s, %d frames of %d points at %g fps; noise %.1f mm",
-        path.name, found.layout, motion.frame_count, len(points), fps, 1e3 * result.noise,
+        "%s: %s, %d frames of %d points at %g fps; noise %s",
+        path.name, found.layout, motion.frame_count, len(points), fps, noise,
     )  # fmt: skip
     return Pointed(motion, report)
 
 
+def _cameras(options: FitOptions) -> tuple[Camera, ...]:
+    """The cameras, in a world of metres with +Y up."""
+    metres = 1.0 if options.metres is None else options.metres
+    turn = np.eye(4)
+    if options.upward is not None:
+        turn[:3, :3] = world_axes(options.upward).T
+    scale = np.array([1.0, 1.0, 1.0, metres])
+    return tuple(
+        replace(camera, extrinsics=camera.extrinsics * scale @ turn)
+        for camera in read_cameras(str(options.camera))
+    )
+
+
+def _extent(pixels: np.ndarray) -> float:
+    """Size [px] of a person in a picture: the median over frames."""
+    known = np.isfinite(pixels).all(-1).sum(-1) > 2
+    seen = pixels[known]
+    return float(np.median(np.nanmax(seen, 1) - np.nanmin(seen, 1), axis=0).max()) if len(seen) else 1.0
+
+
 def _in_metres(path: Path, found: PointFrames, options: FitOptions) -> tuple[torch.Tensor, float]:
-    """Points (F, P, 3) [m], +Y up, and the length of the file's unit [m] as it was taken."""
+    """Points (F, P, 3) [m], +Y up, and the length of the unit [m] as it was taken; pixels as they are."""
+    if options.camera is not None:
+        return torch.as_tensor(found.positions).to(options.device, torch.float32), 1.0
     metres = options.metres
     if metres is None:
         metres = _told_unit(path, found.positions)
@@ -128,7 +161,9 @@ def _unit_error(path: Path, error: InputError, metres: float) -> InputError:
     )  # fmt: skip
 
 
-def _motion(path: Path, layer: SomaLayer, result: PointResult, lengths: torch.Tensor, fps: float) -> Motion:
+def _motion(
+    path: Path, layer: SomaLayer, result: PointResult, lengths: torch.Tensor | None, fps: float
+) -> Motion:
     bones = layer.animation.bone_vectors(layer.identity(), lengths)[0, 1:].cpu().numpy()
     return Motion(
         rotations=result.rotations.cpu().numpy(),
@@ -141,9 +176,9 @@ def _motion(path: Path, layer: SomaLayer, result: PointResult, lengths: torch.Te
     )
 
 
-def _doubts(result: PointResult, lengths: torch.Tensor) -> list[str]:
+def _doubts(result: PointResult, lengths: torch.Tensor | None, extent: float | None) -> list[str]:
     """What is doubtful about a fit: its size, its error, frames that were bridged."""
-    told, size = [], float(lengths.mean())
+    told, size = [], 1.0 if lengths is None else float(lengths.mean())
     if not _SIZES[0] < size < _SIZES[1]:
         told.append(
             f"the person is {size:.2g} times the body's size; pass unit=m, cm or mm if that is not so"
@@ -151,28 +186,34 @@ def _doubts(result: PointResult, lengths: torch.Tensor) -> list[str]:
     gone = int((~result.valid).sum())
     if gone:
         told.append(f"{gone} frames with fewer than three known points are bridged")
-    if result.noise > 0.03:
+    error = float(result.residual.nanmedian())
+    if error > (_MISSED if extent is None else _MISSED_SHARE * extent):
+        missed = f"{1e3 * error:.0f} mm" if extent is None else f"{error:.0f} px"
         told.append(
-            f"points miss the body by {1e3 * result.noise:.0f} mm; is their order that of the set? "
-            "`soma points list` has others"
+            f"points miss the body by {missed}; is their order that of the set? `soma points list` has others"
+            + ("" if extent is None else "; are fx, fy, cx, cy and extrinsics those of the picture?")
         )
     return told
 
 
 def _report(
-    name: str, found: PointFrames, result: PointResult, lengths: torch.Tensor, motion: Motion
-) -> dict:
-    error = 1e3 * result.point_error[torch.isfinite(result.point_error)]
+    name: str, found: PointFrames, result: PointResult, lengths: torch.Tensor | None, motion: Motion
+) -> dict[str, Any]:
+    flat = found.positions.shape[-1] == 2
+    unit, scale = ("px", 1.0) if flat else ("mm", 1e3)
+    error = scale * result.point_error[torch.isfinite(result.point_error)]
     figures = {
         "mean": float(error.mean()), "p95": float(error.quantile(0.95)), "max": float(error.max())
     } if len(error) else {"mean": None, "p95": None, "max": None}  # fmt: skip
     std = result.angle_std[result.valid].nanmedian(0).values
     names = motion.joint_names
-    return {
-        "points": name, "layout": found.layout, "error_mm": {"all": figures},
-        "noise_mm": 1e3 * result.noise, "valid_frames": int(result.valid.sum()),
-        "size": float(lengths.mean()),
-        "bone_scale": {joint: round(float(v), 4) for joint, v in zip(names, lengths[0], strict=True)},
+    report = {
+        "points": name, "layout": found.layout, f"error_{unit}": {"all": figures},
+        f"noise_{unit}": scale * result.noise, "valid_frames": int(result.valid.sum()),
         "angle_std_degrees": {joint: round(float(v), 2) for joint, v in zip(names, std, strict=True)},
         "determined": [names[place] for place in torch.nonzero(result.determined.any(0)).flatten().tolist()],
     }  # fmt: skip
+    if lengths is not None:
+        report["size"] = float(lengths.mean())
+        report["bone_scale"] = {joint: round(float(v), 4) for joint, v in zip(names, lengths[0], strict=True)}
+    return report

@@ -6,7 +6,7 @@ A row's function is imported when it is used: options and help texts cost no tor
 from __future__ import annotations
 
 import importlib
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
@@ -137,7 +137,8 @@ class WriteOptions(Options):
     Attributes:
         blend_shapes: whether skinned files hold the pose correctives; finding shapes for them takes seconds.
         joints: names of the joints that are written, in this order; None: all.
-        camera: JSON file of the camera that sees keypoints; see ``soma_core.io.camera``.
+        camera: JSON file of the camera that sees keypoints; see ``soma_core.io.camera``. With `points` also
+            that in whose picture these are.
         write_up: upward axis of the world of joints and vertices; None: y.
         bvh: of that format.
         video: of MP4 and GIF.
@@ -165,8 +166,10 @@ class WriteOptions(Options):
                 found[name] = str(value)
         return found
 
-    def refuse_unused(self, products: Iterable[Product]) -> None:
+    def refuse_unused(self, products: Iterable[Product], used: Collection[str] = ()) -> None:
         """Refuse settings that nothing among `products` takes, and products whose settings are missing.
+
+        Those `used` by something else are left alone.
 
         Raises:
             InputError: the first one, with the products that would take it.
@@ -174,11 +177,12 @@ class WriteOptions(Options):
         products = list(products)
         for name, value in self.given().items():
             takers = [key for key, row in WRITERS.items() if name in row.settings]
-            if set(takers) & set(products):
+            if set(takers) & set(products) or name in used:
                 continue
             raise InputError(
                 name, got=value, expected=f"none with write=[{','.join(products)}]",
-                fix=f"Leave {name} out, or write one of {', '.join(takers)}.",
+                fix=f"Leave {name} out, or write one of {', '.join(takers)}"
+                + (", or name the points=SET of its picture." if name == "camera" else "."),
             )  # fmt: skip
         if Product.keypoints in products and self.camera is None:
             raise InputError(

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 from omegaconf import OmegaConf
 
 from soma_core.errors import AssetError, InputError, SomaError
+from soma_core.io.point_files import is_one
 from soma_core.motion.conversion import (
     EVERYONE,
     FolderConverted,
@@ -43,7 +44,7 @@ def run(config: DictConfig, output: Path) -> None:
     if not path.exists():
         raise AssetError(path, cause="file is missing", fix="Check the path.")
     try:
-        if path.is_dir():
+        if path.is_dir() and not (options.points and is_one(path, views=options.camera is not None)):
             _say(path, convert_folder(path, output, options=options), output / "report.json")
         elif options.person == EVERYONE:
             for person, converted in convert_people(path, output, options=options).items():

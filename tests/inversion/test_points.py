@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -13,6 +15,8 @@ from soma_core.evaluation.random_poses import random_axis_angles
 from soma_core.geometry.rotations import axis_angle_to_matrix
 from soma_core.inversion.point_priors import JointPrior, JointRange
 from soma_core.inversion.points import PointInversion
+from soma_core.io.camera import Camera
+from soma_core.motion import load_clip
 from soma_core.points.point_set import Point, PointSet
 from tests.bodies import randn
 
@@ -146,3 +150,89 @@ def test_another_unit_is_refused_with_its_factor() -> None:
     points = LAYER.points(LAYER.joints(IDENTITY, _poses(2)), "humanml3d22")
     with pytest.raises(InputError, match=r"Multiply the points by 0\.01"):
         PointInversion(LAYER, "humanml3d22")(100 * points, IDENTITY)
+
+
+def _camera(yaw: float, away: float = 4.0) -> Camera:
+    """A camera that stands at a height of 1.3 m and looks at the body."""
+    eye = np.array([away * np.sin(yaw), 1.3, away * np.cos(yaw)])
+    view = (np.array([0.0, 0.9, 0.0]) - eye) / away
+    view /= np.linalg.norm(view)
+    right = np.cross(view, [0, 1, 0])
+    right /= np.linalg.norm(right)
+    turn = np.stack([right, np.cross(view, right), view])
+    extrinsics = np.eye(4)
+    extrinsics[:3, :3], extrinsics[:3, 3] = turn, -turn @ eye
+    lens = np.array([[1200.0, 0, 640], [0, 1200, 640], [0, 0, 1]])
+    return Camera(intrinsics=lens, extrinsics=extrinsics[None])
+
+
+def _seen(points: Tensor, *cameras: Camera) -> Tensor:
+    return torch.stack([torch.as_tensor(camera.project(points.numpy())[0]) for camera in cameras])
+
+
+def _walk() -> tuple[Tensor, float]:
+    """Points of a person who moves, (F, 17, 3) [m]."""
+    clip = load_clip().cut(slice(300, 324))
+    posed = LAYER.pose(IDENTITY, torch.as_tensor(clip.rotations), torch.as_tensor(clip.translation))
+    return LAYER.points(posed, "coco17"), clip.fps
+
+
+@pytest.mark.parametrize("yaw", [0.4, 2.6])
+def test_one_view_is_met(yaw: float) -> None:
+    points, fps = _walk()
+    camera = _camera(yaw)
+    seen = _seen(points, camera)
+    result = PointInversion(LAYER, "coco17")(seen[0], IDENTITY, cameras=camera, fps=fps)
+    again = LAYER.points(LAYER.pose(IDENTITY, result.rotations, result.translation), "coco17")
+    missed = (_seen(again, camera) - seen).norm(dim=-1)
+    assert missed.mean() < 1  # px: the acceptance bound
+    torch.testing.assert_close(result.point_error.nanmean(), missed.mean(), atol=0.2, rtol=0)
+    assert (again - points).norm(dim=-1).mean() < 0.08  # one view leaves the depth to what is expected [m]
+    assert bool(result.valid.all())
+
+
+def test_two_views_are_met_with_noise_and_gaps() -> None:
+    points, fps = _walk()
+    cameras = _camera(0.0), _camera(1.5)
+    seen = _seen(points, *cameras)
+    seen = seen + randn(*seen.shape, dtype=torch.float32)
+    seen[0, 5, 3:9], seen[:, 20] = torch.nan, torch.nan
+    inversion = PointInversion(LAYER, "coco17")
+    result = inversion(seen, IDENTITY, cameras=cameras, fps=fps)
+    again = LAYER.points(LAYER.pose(IDENTITY, result.rotations, result.translation), "coco17")
+    assert (again - points).norm(dim=-1).mean() < 0.005  # m: the acceptance bound
+    assert result.noise == pytest.approx(1, rel=0.3)
+    assert result.valid.tolist() == [frame != 20 for frame in range(len(points))]
+    scale = inversion.bone_scale(seen, IDENTITY, cameras=cameras)
+    assert scale[0, NAMES.index("LeftShin")] == pytest.approx(1, abs=0.02)
+
+
+def test_frames_of_a_view_that_are_apart() -> None:
+    points, _ = _walk()
+    seen = _seen(points[::8], _camera(0.4))[0]
+    result = PointInversion(LAYER, "coco17", noise=0.5)(seen, IDENTITY, cameras=_camera(0.4))
+    assert result.point_error.mean() < 1
+    alone = PointInversion(LAYER, "coco17", noise=0.5)(seen[2:3], IDENTITY, cameras=_camera(0.4))
+    torch.testing.assert_close(alone.rotations[0], result.rotations[2], atol=1e-2, rtol=0)
+
+
+@pytest.mark.parametrize(
+    ("shape", "cameras", "said"),
+    [
+        ((1, 4, 17, 2), 2, r"\(1, 4, 17, 2\).*2, frames, 17, 2"),
+        ((4, 17, 3), 1, r"\(1, 4, 17, 3\)"),
+        ((2, 4, 17, 2), 3, "as many cameras as views"),
+    ],
+)
+def test_views_that_do_not_fit_the_cameras_are_refused(shape, cameras: int, said: str) -> None:
+    given = [_camera(0.3 * number) for number in range(cameras)]
+    with pytest.raises(InputError, match=said):
+        PointInversion(LAYER, "coco17")(torch.zeros(shape), IDENTITY, cameras=given)
+
+
+def test_cameras_in_millimetres_are_told() -> None:
+    points, fps = _walk()
+    cameras = _camera(0.0), _camera(1.5)
+    far = [replace(c, extrinsics=c.extrinsics * [1, 1, 1, 1000]) for c in cameras]
+    with pytest.raises(InputError, match=r"translations of the cameras by 0\.001"):
+        PointInversion(LAYER, "coco17")(_seen(points, *cameras), IDENTITY, cameras=far, fps=fps)

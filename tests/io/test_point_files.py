@@ -103,7 +103,7 @@ def test_vectors_of_humanml3d(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("values", "said"),
     [
-        (np.zeros((4, 3, 2)), "nothing of depth"),
+        (np.zeros((4, 3, 2)), "camera=FILE.json"),
         (np.zeros((4, 5, 3)), "got 5 points"),
         (np.zeros(7), "expected"),
     ],
@@ -115,3 +115,51 @@ def test_what_is_no_points_is_refused(tmp_path: Path, values: np.ndarray, said: 
     np.savez(tmp_path / "a.npz", vertices=POINTS, faces=POINTS)
     with pytest.raises(InputError, match="faces"):
         read_points(tmp_path / "a.npz", NAMES)
+
+
+def test_points_of_pictures(tmp_path: Path) -> None:
+    """Arrays, tables, OpenPose's folders, COCO's results and MMPose's frames; the person of most score."""
+    flat = POINTS[..., :2]
+    scored = np.concatenate((flat, np.full((4, 3, 1), 0.5)), -1)
+    np.save(tmp_path / "a.npy", scored)
+    found = read_points(tmp_path / "a.npy", NAMES, views=1)
+    _same(found.positions, flat)
+    _same(found.confidence, np.full((4, 3), 0.5))
+    head = ",".join(f"{name}_{axis}" for name in NAMES for axis in "xy")
+    np.savetxt(tmp_path / "a.csv", flat.reshape(4, -1), delimiter=",", header=head, comments="")
+    _same(read_points(tmp_path / "a.csv", NAMES, views=1).positions, flat)
+    pose = tmp_path / "pose"
+    pose.mkdir()
+    for number, frame in enumerate(scored):
+        people = {"people": [{"pose_keypoints_2d": frame.ravel().tolist()}]}
+        (pose / f"clip_{number}_keypoints.json").write_text(json.dumps(people), encoding="utf-8")
+    _same(read_points(pose, NAMES, views=1).positions, flat)
+    coco = [
+        {"image_id": 10 + number, "keypoints": (frame + wrong).ravel().tolist(), "score": 1.0 - wrong}
+        for number, frame in enumerate(scored) for wrong in (0.25, 0.0) if number != 2
+    ]  # fmt: skip
+    (tmp_path / "coco.json").write_text(json.dumps(coco), encoding="utf-8")
+    found = read_points(tmp_path / "coco.json", NAMES, views=1).positions
+    _same(found[[0, 1, 3]], flat[[0, 1, 3]])
+    assert np.isnan(found[2]).all()
+    frames = [{"instances": [{"keypoints": frame.tolist(), "keypoint_scores": [0.5] * 3}]} for frame in flat]
+    (tmp_path / "mm.json").write_text(json.dumps({"instance_info": frames}), encoding="utf-8")
+    found = read_points(tmp_path / "mm.json", NAMES, views=1)
+    _same(found.positions, flat)
+    _same(found.confidence, np.full((4, 3), 0.5))
+
+
+def test_several_views(tmp_path: Path) -> None:
+    views = np.stack([POINTS[..., :2], 2 * POINTS[..., :2]])
+    np.save(tmp_path / "a.npy", views)
+    _same(read_points(tmp_path / "a.npy", NAMES, views=2).positions, views)
+    folder = tmp_path / "views"
+    folder.mkdir()
+    for name, view in zip("ab", views, strict=True):
+        np.save(folder / f"{name}.npy", view)
+    _same(read_points(folder, NAMES, views=2).positions, views)
+    with pytest.raises(InputError, match="got 2 views of 4 frames, expected 3"):
+        read_points(folder, NAMES, views=3)
+    np.save(folder / "b.npy", views[1, :3])
+    with pytest.raises(InputError, match="2 views of 3, 4 frames"):
+        read_points(folder, NAMES, views=2)

@@ -11,6 +11,7 @@ import torch
 
 from soma_core import SomaLayer
 from soma_core.errors import InputError
+from soma_core.io.camera import read_cameras
 from soma_core.io.motion_files import read_motion
 from soma_core.motion import ConvertOptions, InvertOptions, convert_file, invert, load_clip
 
@@ -83,3 +84,33 @@ def test_invert_takes_points_as_well(tmp_path: Path) -> None:
 def test_what_is_no_motion_is_refused(tmp_path: Path, points, options, said: str) -> None:
     with pytest.raises(InputError, match=said):
         _run(tmp_path, points, **options)
+
+
+def _cameras(tmp_path: Path) -> tuple[Path, np.ndarray]:
+    """Two cameras before and beside the body, and what they see (2, F, 22, 2)."""
+    lens = {"fx": 1000, "fy": 1000, "cx": 640, "cy": 640}
+    front = [[1, 0, 0, 0], [0, -1, 0, 1], [0, 0, -1, 4]]
+    side = [[0, 0, -1, 0], [0, -1, 0, 1], [-1, 0, 0, 4]]
+    path = tmp_path / "cameras.json"
+    path.write_text(json.dumps([lens | {"extrinsics": one} for one in (front, side)]), encoding="utf-8")
+    return path, np.stack([camera.project(POINTS)[0] for camera in read_cameras(path)])
+
+
+def test_pictures_become_a_motion(tmp_path: Path) -> None:
+    path, seen = _cameras(tmp_path)
+    found, again = _run(tmp_path, seen, camera=str(path))
+    assert np.linalg.norm(again - POINTS, axis=-1).mean() < 5e-3
+    assert found.report["error_px"]["all"]["mean"] < 0.5
+    assert "px" in str(found)
+    assert found.report["size"] == pytest.approx(1, abs=0.01)
+    one = tmp_path / "one.json"
+    one.write_text(json.dumps(json.loads(path.read_text(encoding="utf-8"))[0]), encoding="utf-8")
+    found, again = _run(tmp_path, np.where(seen[0] < 0, np.nan, seen[0]), camera=str(one))
+    assert np.abs(read_cameras(one)[0].project(again)[0] - seen[0]).mean() < 1
+    with pytest.raises(InputError, match="list of cameras"):
+        _run(tmp_path, seen[0], camera=str(path))
+
+
+def test_a_camera_without_points_is_refused() -> None:
+    with pytest.raises(InputError, match="points=NAME"):
+        InvertOptions(camera="camera.json")
