@@ -181,8 +181,7 @@ class WriteOptions(Options):
                 continue
             raise InputError(
                 name, got=value, expected=f"none with write=[{','.join(products)}]",
-                fix=f"Leave {name} out, or write one of {', '.join(takers)}"
-                + (", or name the points=SET of its picture." if name == "camera" else "."),
+                fix=f"Leave {name} out, or write one of {', '.join(takers)}.",
             )  # fmt: skip
         if Product.keypoints in products and self.camera is None:
             raise InputError(
