@@ -1,8 +1,9 @@
 """Native functions of the pose solver's kernels."""
 
 import functools
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from types import SimpleNamespace
+from typing import TypeVar
 
 import warp as wp
 
@@ -14,9 +15,9 @@ from soma_core.kernels import _view_text as view
 from soma_core.kernels._native import native
 from soma_core.kernels._solver_layout import COUNTS, KEPT, LISTS, NUMBERS, SLOTS
 
-__all__ = ["Task", "descent_functions", "solver_functions"]
+__all__ = ["Task", "descent_functions", "of_identities", "solver_functions"]
 
-_ids = wp.array(dtype=wp.int32)
+_ids, _Made = wp.array(dtype=wp.int32), TypeVar("_Made")
 
 
 _BARE = {
@@ -27,7 +28,19 @@ _BARE = {
 """Bodies that take nothing but the lists and the memory."""
 
 
-@functools.cache
+def of_identities(factory: Callable[..., _Made]) -> Callable[..., _Made]:
+    """Cache what makes kernels for one identity or for one a frame; on a GPU the same ones take both."""
+    made = functools.cache(factory)
+
+    @functools.cache
+    @functools.wraps(factory)
+    def make(scalar: str, lanes: int, *, shared: bool) -> _Made:
+        return made(scalar, lanes, shared=shared or lanes == 1)
+
+    return make
+
+
+@of_identities
 def solver_functions(scalar: str, lanes: int, *, shared: bool) -> SimpleNamespace:
     real = wp.array(dtype=getattr(wp, scalar))
     number = getattr(wp, scalar)
@@ -82,15 +95,18 @@ def _bare(texts: Mapping[str, str], real) -> dict:
 
 
 def _made(bodies: Mapping[str, tuple], scalar: str, lanes: int, *, shared: bool) -> SimpleNamespace:
-    begin = text.prelude(COUNTS, LISTS, NUMBERS, SLOTS, KEPT, shared=shared)
     for _, stub in bodies.values():
         stub.__name__ += "_one" if shared else "_each"
+    texts = {
+        name: text.prelude(COUNTS, LISTS, NUMBERS, SLOTS, KEPT, body, lanes=lanes, shared=shared) + body
+        for name, (body, _) in bodies.items()
+    }
     return SimpleNamespace(
-        **{name: native(begin + body, scalar, lanes, stub) for name, (body, stub) in bodies.items()}
+        **{name: native(texts[name], scalar, lanes, stub) for name, (_, stub) in bodies.items()}
     )
 
 
-@functools.cache
+@of_identities
 def descent_functions(scalar: str, lanes: int, *, shared: bool) -> SimpleNamespace:
     """Functions between those of the solver and of the model's residual, for a whole descent."""
     real = wp.array(dtype=getattr(wp, scalar))

@@ -1,9 +1,11 @@
 """Native bodies of the pose solver: walk, change of the energy, slopes, solution, terms, step.
 
-Every body begins with names of all lists and of the memory of one group of frames (:func:`prelude`). ``S`` is
-that memory, ``K`` an identity's constants: numbers where one identity serves all frames, else vectors.
+Every body begins with names of the lists and of the memory of one group of frames (:func:`prelude`). ``S`` is
+that memory, ``K`` an identity's constants: numbers where one identity serves all frames, else vectors; on a GPU
+one body serves both.
 """
 
+import re
 from collections.abc import Sequence
 
 __all__ = ["ACCEPT", "BEGIN", "CHANGE", "FORCES", "MOVE", "SOLVE", "STILL", "TERMS", "WALK", "prelude"]
@@ -11,26 +13,54 @@ __all__ = ["ACCEPT", "BEGIN", "CHANGE", "FORCES", "MOVE", "SOLVE", "STILL", "TER
 
 def prelude(
     counts: Sequence[str], lists: Sequence[str], numbers: Sequence[str], slots: Sequence[str],
-    kept: Sequence[str], *, shared: bool,
+    kept: Sequence[str], body: str, *, lanes: int, shared: bool,
 ) -> str:  # fmt: skip
-    """Names for everything that the arrays `plan`, `numbers`, `k` and `s` hold."""
-    lines = [f"typedef {'const R*' if shared else 'M'} L; const int* P = plan.data; L K = (L)k.data;"]
-    lines.append("M S = (M)s.data; M F = (M)f.data; const R* Q = numbers.data;")
-    at = 0
-    for name in counts:
-        lines.append(f"const int {name} = P[{at}];")
-        at += 1
+    """Names for what the arrays `plan`, `numbers`, `k` and `s` hold, as far as a body uses them.
+
+    A name costs a compiler time, in every body that has it and in those that this is put into.
+    """
+    lines = {
+        "L": _STRIDED if lanes == 1 else f"typedef {'const R*' if shared else 'M'} L;",
+        "K": "L K(k.data, k.strides[0] / (long long)sizeof(R));" if lanes == 1 else "L K = (L)k.data;",
+        "P": "const int* P = plan.data;", "S": "M S = (M)s.data;", "F": "M F = (M)f.data;",
+        "Q": "const R* Q = numbers.data;", "zero": "const V zero = V{};", "one": "const V one = zero + R(1);",
+    }  # fmt: skip
+    lines |= {name: f"const int {name} = P[{at}];" for at, name in enumerate(counts)}
+    at = len(counts)
     parts = (lists, "const int*", "P"), (numbers, "const R*", "Q"), (slots, "M", "S"), (kept, "M", "F")
     for names, kind, base in parts:
-        for name in names:
-            lines.append(f"{kind} {name} = {base} + P[{at}];")
-            at += 1
-    lines.append("L second = K; L offsets = K + 16 * pair_count; L lefts = offsets + 3 * all_count;")
-    lines.append("L rights = lefts + 9 * channel_count; L axes = rights + 9 * channel_count;")
-    lines.append("L binds = axes + 3 * channel_count; L sizes = binds + 12 * all_count;")
-    lines.append("L shares = sizes + weighted_count;")
-    lines.append("const V zero = V{}; const V one = zero + R(1);")
-    return "\n".join(lines) + "\n"
+        lines |= {name: f"{kind} {name} = {base} + P[{at + i}];" for i, name in enumerate(names)}
+        at += len(names)
+    begin = "K"
+    for name, size in _CONSTANTS.items():
+        lines[name] = f"L {name} = {begin};"
+        begin = f"{name} + {size}"
+    needed, used = set(_words(body)), []
+    for name, line in reversed(lines.items()):
+        if name in needed:
+            used.append(line)
+            needed.update(_words(line))
+    return "\n".join(reversed(used)) + "\n"
+
+
+_STRIDED = """
+struct L {
+    const R* p; int step;
+    CUDA_CALLABLE L(const R* begin, int stride): p(begin), step(stride) {}
+    CUDA_CALLABLE const R& operator[](int i) const { return p[i * step]; }
+    CUDA_CALLABLE L operator+(int i) const { return L(p + i * step, step); }
+};
+"""
+"""Constants of one identity, or of one of those that lie abreast."""
+
+_words = re.compile(r"[A-Za-z_]\w*").findall
+
+_CONSTANTS = {
+    "second": "16 * pair_count", "offsets": "3 * all_count", "lefts": "9 * channel_count",
+    "rights": "9 * channel_count", "axes": "3 * channel_count", "binds": "12 * all_count",
+    "sizes": "weighted_count", "shares": "",
+}  # fmt: skip
+"""An identity's constants, one after the other, and how many numbers each has."""
 
 
 STILL = """

@@ -5,7 +5,6 @@ Python between steps. Matrices are sparse by blocks. The twins are ``inversion.g
 ``inversion.offsets``.
 """
 
-import functools
 from collections.abc import Mapping
 from typing import NamedTuple
 
@@ -26,7 +25,7 @@ from soma_core.kernels._lanes import (
 )
 from soma_core.kernels._native import transposing
 from soma_core.kernels._runtime import as_warp, scalar_name
-from soma_core.kernels._solver_functions import Task, solver_functions
+from soma_core.kernels._solver_functions import Task, of_identities, solver_functions
 from soma_core.kernels._solver_layout import COUNTS, EXTRA, LISTS, NUMBERS, slot_sizes
 from soma_core.kernels.pose_steps_wp import factor_kernel, solution_kernels, step_kernels, tree_kernels
 
@@ -35,7 +34,7 @@ __all__ = ["Factor", "PoseSolver", "Soft"]
 _ids = wp.array(dtype=wp.int32)
 
 
-@functools.cache
+@of_identities
 def _kernel(scalar: str, lanes: int, *, shared: bool):
     number = getattr(wp, scalar)
     real, rows = wp.array(dtype=number), wp.array3d(dtype=number)
@@ -65,19 +64,20 @@ def _kernel(scalar: str, lanes: int, *, shared: bool):
             load(target, moments, 0, at[6], f, last, s, at[2])
             load(threshold, wp.int64(1), 0, 1, f, last, s, at[3])
             load(mass, wp.int64(1), 0, 1, f, last, s, at[4])
-            walk(plan, numbers, k, s, m, 1)
-            change(plan, numbers, k, s, m, 1)
-            copy(plan, numbers, k, s, m, task.forced)
-            for _ in range(task.iterations):
-                assemble(plan, numbers, k, s, m)
-                twists(plan, numbers, k, s, m)
-                forces(plan, numbers, k, s, m)
-                terms(plan, numbers, k, s, m, softs, stiffs, own, count, hinge_end, stiffness, 0)
-                factor(plan, numbers, k, s, m)
-                solve(plan, numbers, k, s, m)
-                move(plan, numbers, k, s, m, stiffs, count, hinge_end, longest)
+            for step in range(task.iterations + 1):  # the first is the start: each function is put in once
+                if step > 0:
+                    assemble(plan, numbers, k, s, m)
+                    twists(plan, numbers, k, s, m)
+                    forces(plan, numbers, k, s, m)
+                    terms(plan, numbers, k, s, m, softs, stiffs, own, count, hinge_end, stiffness, 0)
+                    factor(plan, numbers, k, s, m)
+                    solve(plan, numbers, k, s, m)
+                    move(plan, numbers, k, s, m, stiffs, count, hinge_end, longest)
                 walk(plan, numbers, k, s, m, 1)
-                change(plan, numbers, k, s, m, 0)
+                change(plan, numbers, k, s, m, wp.where(step == 0, 1, 0))
+                if step == 0:
+                    copy(plan, numbers, k, s, m, task.forced)
+                    continue
                 terms(plan, numbers, k, s, m, softs, stiffs, own, count, hinge_end, stiffness, 1)
                 if accept(plan, numbers, k, s, m, damping[1], damping[2], damping[3], damping[4]) == 0:
                     break

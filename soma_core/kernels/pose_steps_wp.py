@@ -7,7 +7,7 @@ import warp as wp
 
 from soma_core.kernels._lanes import row_of
 from soma_core.kernels._native import transposing
-from soma_core.kernels._solver_functions import Task, solver_functions
+from soma_core.kernels._solver_functions import Task, of_identities, solver_functions
 
 __all__ = ["factor_kernel", "solution_kernels", "step_kernels", "tree_kernels"]
 
@@ -41,7 +41,7 @@ def _enter(scalar: str, lanes: int, *, shared: bool):
     return enter
 
 
-@functools.cache
+@of_identities
 def tree_kernels(scalar: str, lanes: int, *, shared: bool) -> SimpleNamespace:
     """The tree of a pose, what it gives the model's residual, and what that says of its joints."""
     number = getattr(wp, scalar)
@@ -95,7 +95,7 @@ def tree_kernels(scalar: str, lanes: int, *, shared: bool) -> SimpleNamespace:
     return SimpleNamespace(posed=posed, slopes=slopes)
 
 
-@functools.cache
+@of_identities
 def step_kernels(scalar: str, lanes: int, *, shared: bool) -> SimpleNamespace:
     """Poses after a step, and the doubt of twists."""
     number = getattr(wp, scalar)
@@ -143,7 +143,7 @@ def step_kernels(scalar: str, lanes: int, *, shared: bool) -> SimpleNamespace:
     return SimpleNamespace(moved=moved, doubted=doubted)
 
 
-@functools.cache
+@of_identities
 def factor_kernel(scalar: str, lanes: int, *, shared: bool):
     """The factorised matrix of the whole model."""
     number = getattr(wp, scalar)
