@@ -21,14 +21,19 @@ class Worker:
     """One implementation in a process of its own."""
 
     def __init__(
-        self, name: str, command: Sequence[str], *, threads: int, checkout: str | None = None
-    ) -> None:
-        """Start it with `threads`, also its last argument; with `checkout`, from the sources there."""
+        self, name: str, command: Sequence[str], *, threads: int, checkout: str | None = None,
+        cache: Path | None = None,
+    ) -> None:  # fmt: skip
+        """Start it with `threads`, also its last argument; with `checkout`, from the sources there.
+
+        Sources of another day store what they derive in another form: they need a `cache` of their own.
+        """
         self.name = name
         where = {**os.environ, **dict.fromkeys(POOLS, str(threads))}
         if checkout is not None:  # its plugins too
             sources = [checkout, *map(str, Path(checkout).glob("plugins/*"))]
             where["PYTHONPATH"] = os.pathsep.join(sources)
+            where["SOMA_CACHE_DIR"] = str(cache)
         self.process = subprocess.Popen(
             [*command, str(threads)], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, cwd=HERE,
             env=where,

@@ -5,8 +5,12 @@
     peer/bin/pip install py-soma-x==0.1.0 anny==0.6.2
     python benchmarks/run.py --peer-python peer/bin/python
 
-Writes ``forward_cpu.json`` and ``inversion_cpu.json`` in ``benchmarks/results``, the tables in
+    git worktree add /tmp/earlier b6ab945
+    python benchmarks/run.py --only inversion --cases own --frames 512 --earlier /tmp/earlier
+
+The first writes ``forward_cpu.json`` and ``inversion_cpu.json`` in ``benchmarks/results``, the tables in
 ``benchmarks/README.md``, and a short one in ``docs/benchmarks.md``. Bars that are missed are said there.
+The second prints how our own fits compare with those of an earlier commit, and writes nothing.
 """
 
 from __future__ import annotations
@@ -21,7 +25,7 @@ import tempfile
 from pathlib import Path
 
 from forward_cpu import forward_tables, run_forward, short_table
-from inversion import PEER_METHODS, inversion_table, run_inversion
+from inversion import CASES, PEER_METHODS, inversion_table, run_inversion
 from processes import HERE, ROOT, cpu_name, short_commit
 
 
@@ -58,14 +62,14 @@ def machine(options: argparse.Namespace, versions: dict) -> dict:
     ours = versions.get("ours") or versions["plain"]
     return {"cpu": cpu_name(), "rounds": options.rounds, "most_rounds": options.most_rounds,
             "threads": options.settings[-1], "seed": options.seed, "torch": ours["torch"],
-            "peer": versions["peer"]["py-soma-x"], "commit": short_commit()}  # fmt: skip
+            "frames": options.frames, "peer": versions.get("peer", {}).get("py-soma-x", ""), "commit": short_commit()}  # fmt: skip
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--peer-python", required=True, help="interpreter with py-soma-x installed")
+    parser.add_argument("--peer-python", help="interpreter with py-soma-x; without it our fits alone")
     parser.add_argument("--only", choices=["forward", "inversion"], help="one of the two benchmarks")
     parser.add_argument("--backends", nargs="+", default=["soma", "anny"], help="of the forward path")
     parser.add_argument("--threads", choices=["1", "all", "both"], default="both",
@@ -79,16 +83,22 @@ def main() -> None:
     parser.add_argument(
         "--peer-methods", nargs="+", default=PEER_METHODS, choices=PEER_METHODS, help="of pose inversion"
     )
+    parser.add_argument("--cases", nargs="+", default=CASES, choices=CASES, help="of pose inversion")
     parser.add_argument("--earlier", help="another checkout of ours, whose fits are timed beside")
     options = parser.parse_args()
-    options.peer_python = str(Path(options.peer_python).absolute())
+    if options.peer_python:
+        options.peer_python = str(Path(options.peer_python).absolute())
+    elif options.only != "inversion":
+        parser.error("--peer-python is missing: the forward path is compared with the peer's")
     cores = len(os.sched_getaffinity(0))
     options.settings = {"1": [1], "all": [cores], "both": sorted({1, cores})}[options.threads]
     if options.quick:
         vars(options).update(rounds=2, most_rounds=2, seconds=0.01, frames=10)
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        subprocess.run([sys.executable, "peers.py", "build", str(folder / "assets")], check=True, cwd=HERE)
+        if options.peer_python:
+            build = [sys.executable, "peers.py", "build", str(folder / "assets")]
+            subprocess.run(build, check=True, cwd=HERE)
         if options.only != "inversion":
             settings = run_forward(options, folder)
             versions = settings[0]["backends"][options.backends[0]]["versions"]
@@ -97,7 +107,11 @@ def main() -> None:
         if options.only != "forward":
             versions, rows = run_inversion(options, folder)
             results = {"machine": machine(options, versions), "rows": rows}
-            store("inversion_cpu", "inversion", results, inversion_table(results))
+            table = inversion_table(results)
+            if options.peer_python:
+                store("inversion_cpu", "inversion", results, table)
+            else:
+                sys.stdout.write(table + "\n")
 
 
 if __name__ == "__main__":

@@ -50,12 +50,11 @@ def _nearest_function(scalar: str, module: wp.Module, cofactor: wp.Function) -> 
 
 
 def kabsch_function(scalar: str, module: wp.Module) -> wp.Function:
-    """``rotation_from_covariance`` as a Warp function of `module`, with its closed-form derivative."""
+    """``rotation_from_covariance`` as a Warp function of `module`."""
     real = getattr(wp, scalar)
     vec3, mat33 = wp.types.vector(3, real), wp.types.matrix((3, 3), real)
     prior = wp.constant(real(PRIOR_STRENGTH))
     floor = wp.constant(real(1e-24 if scalar == "float32" else 1e-162))
-    tiny = wp.constant(real(1e-30 if scalar == "float32" else 1e-100))
 
     @wp.func(module=module)
     def cofactor(m: mat33):
@@ -67,20 +66,6 @@ def kabsch_function(scalar: str, module: wp.Module) -> wp.Function:
         return wp.matrix_from_rows(wp.cross(b, c), wp.cross(c, a), wp.cross(a, b))
 
     nearest = _nearest_function(scalar, module, cofactor)
-
-    @wp.func_grad(nearest)
-    def adj_nearest(covariance: mat33, adj_ret: mat33):
-        rotation = nearest(covariance)
-        stretch = wp.transpose(rotation) * covariance
-        stretch = real(0.5) * (stretch + wp.transpose(stretch))
-        system = wp.trace(stretch) * wp.identity(n=3, dtype=real) - stretch
-        local = wp.transpose(rotation) * adj_ret
-        torque = vec3(local[2, 1] - local[1, 2], local[0, 2] - local[2, 0], local[1, 0] - local[0, 1])
-        det = wp.determinant(system)
-        if wp.abs(det) < tiny:
-            det = tiny
-        u = (cofactor(system) * torque) / det
-        wp.adjoint[covariance] += rotation * wp.skew(u)
 
     @wp.func(module=module)
     def from_covariance(covariance: mat33):

@@ -22,13 +22,11 @@ _ids, _table = wp.array(dtype=wp.int64), wp.array2d(dtype=wp.int64)
 
 
 @functools.cache
-def _kernels(scalar: str) -> SimpleNamespace:
+def _displace(scalar: str) -> wp.Kernel:
     module = wp.get_module(f"soma_skeleton_fit_{scalar}")
     types = _types(scalar)
     vec3, mat33 = types.vec3, types.mat33
-    from_covariance = kabsch_function(scalar, module)
-    arc, pair_normal = bone_functions(scalar, module)
-    fan_covariance = _fan_covariance(types, module, pair_normal)
+    from_covariance, arc, fan_covariance = _forward(types, module)
     positions, matrices = wp.array2d(dtype=vec3), wp.array2d(dtype=mat33)
 
     @wp.kernel(module=module, enable_backward=False)
@@ -46,10 +44,15 @@ def _kernels(scalar: str) -> SimpleNamespace:
             total = fan_covariance(b, p, k, children, bind, joints, first)
             out[b, p] = from_covariance(total) * first
 
-    functions = types, module, from_covariance, arc, fan_covariance
-    return SimpleNamespace(vec3=vec3, mat33=mat33, displace=displace, pull_back=_pull_back(*functions))
+    return displace
 
 
+def _forward(types: SimpleNamespace, module: wp.Module) -> tuple[wp.Function, wp.Function, wp.Function]:
+    arc, pair_normal = bone_functions(types.scalar, module)
+    return kabsch_function(types.scalar, module), arc, _fan_covariance(types, module, pair_normal)
+
+
+@functools.cache
 def _types(scalar: str) -> SimpleNamespace:
     real = getattr(wp, scalar)
     return SimpleNamespace(
@@ -83,12 +86,16 @@ def _fan_covariance(types: SimpleNamespace, module: wp.Module, pair_normal: wp.F
     return fan_covariance
 
 
-def _pull_back(
-    types: SimpleNamespace, module: wp.Module, from_covariance: wp.Function, arc: wp.Function,
-    fan_covariance: wp.Function,
-) -> wp.Kernel:  # fmt: skip
-    """Kernel of the derivative of ``displace``: gradients of joints are added, those of covariances set."""
+@functools.cache
+def _pull_back(scalar: str) -> wp.Kernel:
+    """Kernel of the derivative of ``displace``: gradients of joints are added, those of covariances set.
+
+    It has a module of its own, which only those compile who ask for a gradient.
+    """
+    module = wp.get_module(f"soma_skeleton_fit_gradient_{scalar}")
+    types = _types(scalar)
     vec3, mat33 = types.vec3, types.mat33
+    from_covariance, arc, fan_covariance = _forward(types, module)
     kabsch_gradient, arc_gradient = _kabsch_gradient(types, module), _arc_gradient(types, module)
     fan_gradient = _fan_gradient(types, module)
     positions, matrices = wp.array2d(dtype=vec3), wp.array2d(dtype=mat33)
@@ -251,17 +258,18 @@ def _fan_gradient(types: SimpleNamespace, module: wp.Module) -> wp.Function:
 def _fit(
     joints: Tensor, covariances: Tensor, bind: Tensor, pivots: Tensor, children: Tensor
 ) -> Tensor:  # fmt: skip
-    kernels = _kernels(scalar_name(joints.dtype))
+    scalar = scalar_name(joints.dtype)
+    types = _types(scalar)
     out = joints.new_empty(len(joints), len(pivots), 3, 3)
     if not out.numel():  # Warp takes no view of an empty tensor
         return out
     with launching(joints) as device:
         wp.launch(
-            kernels.displace,
+            _displace(scalar),
             dim=tuple(out.shape[:2]),
-            inputs=[as_warp(pivots), as_warp(children), as_warp(bind, kernels.vec3),
-                    as_warp(joints, kernels.vec3), as_warp(covariances, kernels.mat33)],
-            outputs=[as_warp(out, kernels.mat33)],
+            inputs=[as_warp(pivots), as_warp(children), as_warp(bind, types.vec3),
+                    as_warp(joints, types.vec3), as_warp(covariances, types.mat33)],
+            outputs=[as_warp(out, types.mat33)],
             device=device,
         )  # fmt: skip
     return out
@@ -276,7 +284,8 @@ def _(joints, covariances, bind, pivots, children):
 def _fit_backward(
     grad: Tensor, joints: Tensor, covariances: Tensor, bind: Tensor, pivots: Tensor, children: Tensor
 ) -> tuple[Tensor, Tensor]:  # fmt: skip
-    kernels = _kernels(scalar_name(joints.dtype))
+    scalar = scalar_name(joints.dtype)
+    types = _types(scalar)
     contiguous = torch.contiguous_format
     joints_grad = torch.zeros_like(joints, memory_format=contiguous)
     covariances_grad = torch.zeros_like(covariances, memory_format=contiguous)
@@ -285,12 +294,12 @@ def _fit_backward(
         return joints_grad, covariances_grad
     with launching(joints) as device:
         wp.launch(
-            kernels.pull_back,
+            _pull_back(scalar),
             dim=tuple(grad.shape[:2]),
-            inputs=[as_warp(pivots), as_warp(children), as_warp(bind, kernels.vec3),
-                    as_warp(joints, kernels.vec3), as_warp(covariances, kernels.mat33),
-                    as_warp(grad, kernels.mat33)],
-            outputs=[as_warp(joints_grad, kernels.vec3), as_warp(covariances_grad, kernels.mat33)],
+            inputs=[as_warp(pivots), as_warp(children), as_warp(bind, types.vec3),
+                    as_warp(joints, types.vec3), as_warp(covariances, types.mat33),
+                    as_warp(grad, types.mat33)],
+            outputs=[as_warp(joints_grad, types.vec3), as_warp(covariances_grad, types.mat33)],
             device=device,
         )  # fmt: skip
     return joints_grad, covariances_grad

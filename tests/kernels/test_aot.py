@@ -107,6 +107,18 @@ def test_kernels_lie_where_they_are_looked_for():
     assert len(FILES) > 8
 
 
+def test_a_gpu_compiles_kernels_of_one_identity_and_of_many_once():
+    made = [
+        [factory("float32", 1, shared=shared) for shared in (True, False)]
+        for path in FILES
+        for factory in vars(importlib.import_module(f"soma_core.kernels.{path.stem}")).values()
+        if hasattr(factory, "cache_info") and "shared" in inspect.signature(factory).parameters
+        and "lanes" in inspect.signature(factory).parameters
+    ]  # fmt: skip
+    assert len(made) > 2
+    assert all(one is each for one, each in made)
+
+
 def test_what_is_for_the_cpu_only_exists_and_says_why():
     known = {name for path in FILES for name in defined_kernels(path).values()}
     assert known >= CPU_ONLY.keys()
