@@ -62,7 +62,8 @@ def machine(options: argparse.Namespace, versions: dict) -> dict:
     ours = versions.get("ours") or versions["plain"]
     return {"cpu": cpu_name(), "rounds": options.rounds, "most_rounds": options.most_rounds,
             "threads": options.settings[-1], "seed": options.seed, "torch": ours["torch"],
-            "frames": options.frames, "peer": versions.get("peer", {}).get("py-soma-x", ""), "commit": short_commit()}  # fmt: skip
+            "frames": options.frames, "commit": short_commit(),
+            "peer": versions.get("peer", {}).get("py-soma-x", "")}  # fmt: skip
 
 
 def main() -> None:

@@ -1,8 +1,8 @@
 """Native bodies of the pose solver: walk, change of the energy, slopes, solution, terms, step.
 
 Every body begins with names of the lists and of the memory of one group of frames (:func:`prelude`). ``S`` is
-that memory, ``K`` an identity's constants: numbers where one identity serves all frames, else vectors; on a GPU
-one body serves both.
+that memory, ``K`` an identity's constants: numbers where one identity serves all frames, else vectors; on a
+GPU one body serves both.
 """
 
 import re
