@@ -35,6 +35,9 @@ BODY_COLOUR = (0.80, 0.66, 0.58)
 _READ = 4
 """Influences of a vertex that many programs read, and no more."""
 
+_CHUNK = 64
+"""Frames whose skin is looked at together."""
+
 _BONE_TOLERANCE = 1e-6
 """Change of a bone relative to the size of the scene that counts as float32 rounding of the transforms."""
 
@@ -111,16 +114,20 @@ def four_influence_error(clip: SkinnedClip) -> tuple[float, float]:
     starts = np.arange(len(rows) + 1) * weights.shape[1]
     lost = scipy.sparse.csr_array((change[rows].ravel(), joint_ids[rows].ravel(), starts), shape=shape)
     points = np.column_stack([clip.rest[rows], np.ones(len(rows))])
-    inverse, local = np.linalg.inv(clip.bind_world), np.tile(np.eye(4), (shape[1], 1, 1))
+    inverse, parents = np.linalg.inv(clip.bind_world), clip.rig.parents
     total, worst = 0.0, 0.0
-    for translations, quaternions in zip(clip.translations, clip.quaternions, strict=True):
-        local[:, :3, 3], local[:, :3, :3] = translations, Rotation.from_quat(quaternions).as_matrix()
-        world = local.copy()
-        for joint in np.flatnonzero(clip.rig.parents >= 0):
-            world[joint] = world[clip.rig.parents[joint]] @ local[joint]
-        blended = (lost @ (world @ inverse)[:, :3].reshape(-1, 12)).reshape(-1, 3, 4)
-        error = np.linalg.norm(np.einsum("vab,vb->va", blended, points), axis=1)
-        total, worst = total + error.sum(), max(worst, float(error.max(initial=0)))
+    for start in range(0, clip.frame_count, _CHUNK):
+        part = slice(start, start + _CHUNK)
+        turns = Rotation.from_quat(clip.quaternions[part].reshape(-1, 4)).as_matrix()
+        world = np.tile(np.eye(4), (*clip.translations[part].shape[:2], 1, 1))
+        world[..., :3, :3] = turns.reshape(*world.shape[:2], 3, 3)
+        world[..., :3, 3] = clip.translations[part]
+        for joint in np.flatnonzero(parents >= 0):
+            world[:, joint] = world[:, parents[joint]] @ world[:, joint]
+        for transforms in (world @ inverse)[..., :3, :].reshape(len(world), shape[1], 12):
+            blended = (lost @ transforms).reshape(-1, 3, 4)
+            error = np.linalg.norm(np.einsum("vab,vb->va", blended, points), axis=1)
+            total, worst = total + error.sum(), max(worst, float(error.max(initial=0)))
     return total / (clip.frame_count * len(clip.rest)), worst
 
 

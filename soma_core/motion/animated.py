@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from soma_core.animation.posed import Posed
     from soma_core.skeleton.identity import Identity
 
-__all__ = ["Animated", "animate"]
+__all__ = ["Animated", "animate", "standing_motion"]
 
 _log = logging.getLogger(__name__)
 
@@ -91,8 +91,7 @@ def animate(
         InputError: absolute rotations that were made for another rig; a frame to keep that there is not;
             a choice that there is not, or that does not go with `translation`.
     """
-    if not check_rig(motion, layer.rig.revision):
-        _log.info("the motion was made for rig %s; its relative rotations carry over", motion.rig_revision)
+    _say_rig(layer, motion)
     ground = _ground_choice(translation, ground, contacts)
     wanted = set(keep or ())
     if not wanted <= set(range(motion.frame_count)):
@@ -122,6 +121,29 @@ def animate(
         feet=played.track,
         contacts=held,
     )
+
+
+def standing_motion(
+    layer: SomaLayer,
+    identity: Identity,
+    motion: Motion,
+    *,
+    translation: str = "ground",
+    ground: str | None = None,
+    contacts: str = "free",
+) -> Motion:
+    """The motion that :func:`animate` gives; no frame is posed where it only keeps the recorded path."""
+    choice = _ground_choice(translation, ground, contacts)
+    if (translation, choice, contacts) != ("motion", "none", "free"):
+        placing = {"translation": translation, "ground": ground, "contacts": contacts}
+        return animate(layer, identity, motion, **placing).motion
+    _say_rig(layer, motion)
+    return replace(motion, rig_revision=layer.rig.revision, skeleton=skeleton_of(layer.rig, identity))
+
+
+def _say_rig(layer: SomaLayer, motion: Motion) -> None:
+    if not check_rig(motion, layer.rig.revision):
+        _log.info("the motion was made for rig %s; its relative rotations carry over", motion.rig_revision)
 
 
 @dataclass(kw_only=True, eq=False)

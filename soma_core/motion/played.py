@@ -20,10 +20,9 @@ from soma_core.errors import InputError
 from soma_core.io.clip import SkinnedClip, skinned_clip, t_pose_world
 from soma_core.io.joint_files import JointFrames, JointPiece, chosen_joints
 from soma_core.io.motion import Motion
-from soma_core.io.motion_files import check_rig
 from soma_core.io.vertex_writers import MeshFrames, canonical_frames
 from soma_core.layer import SomaLayer
-from soma_core.motion.animated import animate
+from soma_core.motion.animated import standing_motion
 from soma_core.motion.identities import stored_identity
 from soma_core.motion.models import open_layer
 from soma_core.motion.options import ConvertOptions
@@ -102,9 +101,10 @@ class Played:
             colour=backend_colour(layer.backend), metadata=metadata,
             shapes=self._shapes() if blend_shapes else None,
         )  # fmt: skip
-        for text in made.limits.values():
+        limits = made.limits  # poses every frame
+        for text in limits.values():
             _log.info("skinned files: %s", text)
-        return replace(made, metadata=made.metadata | made.limits)
+        return replace(made, metadata={**made.metadata, **limits})
 
     def _shapes(self) -> CorrectiveShapes | None:
         """What the correctives add, for files that skin."""
@@ -202,12 +202,7 @@ class MovingBodies:
 
     def played(self, layer: SomaLayer, stored: Mapping[str, Any], motion: Motion) -> Played:
         """The motion on that body, where it is to stand."""
-        if not check_rig(motion, layer.rig.revision):
-            _log.info(
-                "the motion was made for rig %s; its relative rotations carry over", motion.rig_revision
-            )
         with torch.no_grad():
             identity = stored_identity(layer, stored)
-            if self._placing != {"translation": "motion"}:
-                motion = animate(layer, identity, motion, **self._placing).motion
+            motion = standing_motion(layer, identity, motion, **self._placing)
         return Played(layer=layer, identity=identity, motion=replace(motion, identity=stored))

@@ -11,7 +11,7 @@ import torch
 from omegaconf import OmegaConf
 
 from soma_core.errors import InputError
-from soma_core.motion.animated import animate
+from soma_core.motion.animated import standing_motion
 from soma_core.motion.conversion import load_clip
 from soma_core.motion.identities import backend_of, stored_identity
 from soma_core.motion.models import open_layer
@@ -70,10 +70,10 @@ def run(config: DictConfig, output: Path) -> None:
     )
     with torch.no_grad():
         identity = stored_identity(layer, stored)
-        placed = animate(
+        placed = standing_motion(
             layer, identity, motion, translation=options.translation, ground=options.ground,
             contacts=options.contacts,
-        ).motion  # fmt: skip
+        )  # fmt: skip
     played = Played(layer=layer, identity=identity, motion=replace(placed, identity=stored))
     written = write_products(
         played, options.write, lambda product: output / WRITERS[product].file,
