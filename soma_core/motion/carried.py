@@ -59,6 +59,12 @@ def carried(path: Path, layout: str, options: ConvertOptions) -> Retargeted:
     if left:
         more = " ..." if len(left) > _SHOWN else ""
         _log.info("%s: not carried over: %s%s", path.name, ", ".join(left[:_SHOWN]), more)
+    slopes = found.report["foot_slopes_degrees"]
+    if slopes:
+        _log.info(
+            "%s: soles are as flat as there, so lines from ankle to toes are up to %.1f degrees off; "
+            "match=bones for those", path.name, max(slopes.values()),
+        )  # fmt: skip
     scale = found.report["path_scale"]
     if scale != 1:
         _log.info(

@@ -331,5 +331,5 @@ def _row(
     report = converted.report
     row = {"state": "converted", "layout": report["settings"]["layout"], "frames": report["frames"],
            "fps": report["settings"]["fps"], "error_mm": converted.error_mm}  # fmt: skip
-    row |= {"warnings": report["warnings"]} if report.get("warnings") else {}
+    row |= {key: report[key] for key in ("warnings", "foot_slopes_degrees") if report.get(key)}
     return row, str(converted)

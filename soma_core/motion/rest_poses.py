@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -20,6 +20,9 @@ _BENT = 0.1
 
 _LOW = 0.5
 """Share of frames whose toes are lowest, and of these the share that moves least: there a foot stands."""
+
+_STEADY, _SLOPES = np.radians(8), np.radians((2, 50))
+"""Spread of the middle half of those frames, and slopes from ankle to toes, of a foot that stands flat."""
 
 _CLOSE = np.cos(np.radians(15))
 _SAME_POSE = np.cos(np.radians(5))
@@ -43,11 +46,14 @@ class Alignment:
         turns: by the names of joints here; spine and neck by their joint there.
         along: joint of spine or neck there -> its turn.
         kind: of the other's rest pose, in words.
+        slopes: foot -> angle [degrees] by which its line from ankle to toes is left off the other's, for the
+            sake of the sole.
     """
 
     turns: Mapping[str, np.ndarray]
     along: Mapping[int, np.ndarray]
     kind: str
+    slopes: Mapping[str, float] = field(default_factory=dict)
 
     def chain(self, joints: Sequence[int]) -> list[np.ndarray]:
         """Turns of the joints of spine or neck."""
@@ -129,6 +135,7 @@ class _Aligner:
         self._limbs, self._soles = by == "limbs" and found.standing, by == "soles"
         self._found: dict[str, np.ndarray] = {}
         self._along: dict[int, np.ndarray] = {}
+        self._slopes: dict[str, float] = {}
 
     def align(self, spine: Sequence[int], neck: Sequence[int]) -> Alignment:
         self._found["Hips"] = self._hips(spine)
@@ -141,7 +148,7 @@ class _Aligner:
             if name in self._match and name not in self._found:
                 self._found[name] = self._joint(name, last)
         kind = "standing" if self._standing else "bones along axes"
-        return Alignment(turns=self._found, along=self._along, kind=kind)
+        return Alignment(turns=self._found, along=self._along, kind=kind, slopes=self._slopes)
 
     def _hips(self, spine: Sequence[int]) -> np.ndarray:
         """The nearest turn by quarters that puts left and up where they are at rest."""
@@ -226,10 +233,17 @@ class _Aligner:
             return np.eye(3)
         ahead = unit_vector(bones[0] * [1, 0, 1])
         sloped = np.hypot(there[0], there[2]) * ahead + [0, there[1], 0]
-        return _shortest(sloped, bones[0]) if np.any(sloped) else np.eye(3)
+        if not np.any(sloped):
+            return np.eye(3)
+        turn = _shortest(sloped, bones[0])
+        self._slopes[name] = float(np.degrees(Rotation.from_matrix(turn).magnitude()))
+        return turn
 
     def _standing_foot(self, name: str) -> np.ndarray | None:
-        """From ankle to toes where a foot stands: the middle of its frames in which it is low and still."""
+        """From ankle to toes where a foot stands: the middle of its frames in which it is low and still.
+
+        None where these are no frames of a foot that stands flat: the direction of its bone is all there is.
+        """
         toe = name.replace("Foot", "ToeBase")
         if toe not in self._match:
             return None
@@ -238,9 +252,12 @@ class _Aligner:
         speed = np.linalg.norm(np.gradient(ball, axis=0), axis=1) if len(ball) > 1 else np.zeros(1)
         low = ball[:, 1] <= np.quantile(ball[:, 1], _LOW)
         still = low & (speed <= np.quantile(speed[low], _LOW))
-        level = (ankle - ball)[still]
-        heading = np.median(np.hypot(level[:, 0], level[:, 2]))
-        return -np.array([heading, np.median(level[:, 1]), 0.0])
+        bone = (ball - ankle)[still]
+        slopes = np.arctan2(-bone[:, 1], np.hypot(bone[:, 0], bone[:, 2]))
+        first, slope, last = np.quantile(slopes, (0.25, 0.5, 0.75))
+        if last - first > _STEADY or not _SLOPES[0] < slope < _SLOPES[1]:
+            return None
+        return np.array([np.cos(slope), -np.sin(slope), 0])
 
     def _head(self, above: int, turn: np.ndarray) -> np.ndarray:
         """The turn by quarters that has people look ahead on average: no bone tells how a head is held."""

@@ -97,6 +97,7 @@ def retarget(
     report = _joints_report(source, joints, spine, neck) | {
         "rest_pose": alignment.kind, "unit_metres": found.metres, "up": found.up, "legs_metres": legs,
         "path_scale": scale, "at_rest": [name for name in USER_JOINTS if name not in goals],
+        "foot_slopes_degrees": {name: round(angle, 2) for name, angle in alignment.slopes.items()},
     }  # fmt: skip
     return Retargeted(motion=motion, report=report, source=source)
 

@@ -173,6 +173,15 @@ def test_soles_are_as_flat_as_there(along, higher, rig):
     assert np.abs(pitch).max() < FLAT_DEGREES
     apart = bones_apart(along_axes(source) if along else source, found, rig)
     assert max(angle for name, angle in apart.items() if "Toe" not in name) < SAME_DEGREES
+    told = found.report["foot_slopes_degrees"]
+    assert told == pytest.approx({"LeftFoot": apart["LeftToeBase"], "RightFoot": apart["RightToeBase"]}, abs=0.05)
+
+
+def test_feet_that_never_stand_flat_keep_their_bones(rig):
+    source = lafan_like()  # feet turn at random: no frame tells the sole
+    found = retarget(source, match="soles")
+    assert max(bones_apart(source, found, rig).values()) < SAME_DEGREES
+    assert found.report["foot_slopes_degrees"] == {}
 
 
 def test_twist_comes_from_knees_and_elbows_where_bones_rest_along_axes(rig):
