@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Literal, get_args
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from soma_core.cache import atomic_arrays
 from soma_core.errors import InputError
@@ -60,6 +61,8 @@ class SmplMotion:
         up: upward axis of the world: ``+z`` in AMASS, ``-y`` in a camera.
         about: what the root rotation turns about, before the translation: the pelvis, or the origin of the
             model as EasyMocap has it.
+        camera_turns: (frames, 3) axis-angle vectors [rad] of the camera that the motion was brought into the
+            world by, about the origin; the root has turned by them. None for none.
         flat_hands: whether zero is a flat hand; False: the model's mean hand.
         hand_components: (frames, 2 n) coefficients of the model's own components of both hands, left first,
             which its fingers turn by as well; None for none.
@@ -77,6 +80,7 @@ class SmplMotion:
     fps: float
     up: UpAxis = "+z"
     about: Literal["pelvis", "origin"] = "pelvis"
+    camera_turns: np.ndarray | None = None
     flat_hands: bool = True
     hand_components: np.ndarray | None = None
     source: str = ""
@@ -105,6 +109,17 @@ class SmplMotion:
     def frame_count(self) -> int:
         """Number of frames."""
         return len(self.rotations)
+
+    def about_pelvis(self, pelvis: np.ndarray) -> np.ndarray:
+        """Translation (frames, 3) [m] beside a root that turns about the pelvis.
+
+        Args:
+            pelvis: (3,) where it is at rest [m], which the file does not tell.
+        """
+        turns = self.rotations[:, 0] if self.about == "origin" else self.camera_turns
+        if turns is None:
+            return self.translation
+        return np.asarray(self.translation + Rotation.from_rotvec(turns).apply(pelvis) - pelvis, np.float32)
 
 
 def _expect(argument: str, array: np.ndarray, shape: tuple[int, ...]) -> None:

@@ -21,6 +21,7 @@ import numpy as np
 
 from soma_core.errors import AssetError
 from soma_core.files import refuse_unreadable
+from soma_core.io.json_frames import holds_pose_frames, read_pose_frames
 from soma_core.io.motion_pickle import array_text, is_tensor, run_motion_pickle, tensor_array
 from soma_core.io.pickled_arrays import RecordArrays
 from soma_core.io.torch_file import read_torch_arrays
@@ -145,7 +146,7 @@ class DataFile:
 
 @contextmanager
 def open_data(path: str | Path) -> Iterator[DataFile]:
-    """Open a file of `DATA_SUFFIXES`.
+    """Open a file of `DATA_SUFFIXES`, or a folder of JSON frames.
 
     Raises:
         AssetError: missing, damaged, a git-LFS pointer, of another kind than its suffix says, or a pickle
@@ -153,7 +154,9 @@ def open_data(path: str | Path) -> Iterator[DataFile]:
     """
     path = Path(path).expanduser()
     suffix = path.suffix.lower()
-    if suffix == ".npz":
+    if holds_pose_frames(path):
+        yield DataFile(path, read_pose_frames(path))
+    elif suffix == ".npz":
         with open_npz_file(path, fix="Give a complete .npz file.") as file:
             yield DataFile(path, {name: _npz_value(file, name) for name in file.names})
     elif suffix == ".npy":

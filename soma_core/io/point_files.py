@@ -13,6 +13,7 @@ import numpy as np
 
 from soma_core.errors import InputError
 from soma_core.io.data_files import DATA_SUFFIXES, open_data
+from soma_core.io.json_frames import frame_files
 from soma_core.json_file import read_json
 
 __all__ = ["POINT_SUFFIXES", "PointFrames", "is_one", "read_points"]
@@ -270,7 +271,7 @@ def _cells(path: Path, number: int, row: Sequence[str], count: int) -> list[floa
 
 def _of_folder(path: Path, person: str | None, size: int) -> PointFrames:
     """A folder of OpenPose or EasyMocap: a JSON file a frame, by the order of their names."""
-    files = sorted(path.glob("*.json"), key=lambda file: _numbered(file.name))
+    files = frame_files(path)
     if not files:
         raise InputError(str(path), got="no .json in it", expected="a file a frame", fix="Name their folder.")
     frames = [_person(file, read_json(file, fix="Write it again."), person, size) for file in files]

@@ -14,8 +14,8 @@ from soma_core.io.rotation_shapes import split_shape
 from soma_core.io.smpl_names import PARTS, RATES, Space, Tool, part_of, space_of, tool_of
 
 __all__ = [
-    "BODY_JOINTS", "POSE_JOINTS", "FoundBody", "choose_body", "find_bodies", "holds_poses", "people_in",
-    "shown_names", "strange_poses", "wanted_names",
+    "BODY_JOINTS", "POSE_JOINTS", "FoundBody", "choose_body", "find_bodies", "holds_poses",
+    "no_bodies", "people_in", "shown_names",
 ]  # fmt: skip
 
 POSE_JOINTS = (24, 52, 55, 22)
@@ -44,6 +44,9 @@ _CONTAINERS = frozenset(
     ]
 )
 """Names on the way to a body that tell nothing about whose it is."""
+
+_ROMP = ("smpl_thetas", "smpl_betas", "cam_trans")
+"""Keys of a result of ROMP or BEV."""
 
 _DEEPEST, _MOST_NODES, _MOST_SEEN = 6, 50_000, 1_000_000
 _LONGEST_LIST = 64
@@ -172,11 +175,12 @@ class _Walk:
     def _of_names(
         self, node: Mapping[Any, Any], way: tuple[str, ...], above: Mapping[str, Any]
     ) -> Iterator[Any]:
-        tracks = _tracks(node)
+        tracks, tool = _tracks(node), tool_of({"tracks"})
+        if not tracks:
+            tracks, tool = self._images(node), tool_of({"smpl_thetas", "cam_trans"})
         if tracks:
             for person, parts in tracks.items():
-                body = FoundBody(person=person, space="camera", parts=parts, tool=tool_of({"tracks"}))
-                yield len(way), body
+                yield len(way), FoundBody(person=person, space="camera", parts=parts, tool=tool)
             return
         named = self._named(node, way)
         shared = dict(above) | {part: named[part, None] for part in _SHARED if (part, None) in named}
@@ -187,8 +191,35 @@ class _Walk:
             for body in self._people(parts, way, space, names):
                 yield len(way), body
         for key, value in node.items():
-            if isinstance(value, (dict, list, tuple)):
+            again = key == "sequence_results" and "results" in node  # the same by track, as ROMP has it
+            if isinstance(value, (dict, list, tuple)) and not again:
                 yield from self.bodies(value, (*way, str(key)), shared)
+
+    def _images(self, node: Mapping[Any, Any]) -> dict[str, dict[str, tuple[str, Any]]]:
+        """Bodies of a result that lists the people of each image (ROMP, BEV), by their tracks or order."""
+        images = [node] if "smpl_thetas" in node else list(node.values())
+        seen: dict[str, dict[str, list[Any]]] = {}
+        for number, image in enumerate(images):
+            if not isinstance(image, dict) or "frame_id" in image or not {*_ROMP} <= image.keys():
+                return {}
+            try:
+                arrays = {key: self._file.array(image[key]) for key in (*_ROMP, "track_ids") if key in image}
+            except ValueError:
+                return {}
+            count = len(np.atleast_1d(arrays["smpl_thetas"]))
+            if any(array.ndim < 1 or len(array) != count for array in arrays.values()):
+                return {}
+            for place in range(count):
+                person = str(arrays["track_ids"][place]) if "track_ids" in arrays else str(place)
+                track = seen.setdefault(person, {name: [] for name in (*_ROMP, "frames")})
+                track["frames"].append(number)
+                for name in _ROMP:
+                    track[name].append(arrays[name][place])
+        parts = dict(zip((*_ROMP, "frames"), ("pose", "betas", "trans", "frames"), strict=True))
+        return {
+            person: {parts[name]: (name, values) for name, values in track.items()}
+            for person, track in seen.items()
+        }
 
     def _named(
         self, node: Mapping[Any, Any], way: tuple[str, ...]
@@ -298,7 +329,7 @@ def _seen_in(frame: Mapping[Any, Any]) -> Iterator[tuple[str, Mapping[Any, Any]]
             yield str(person), body
 
 
-def strange_poses(file: DataFile) -> Iterator[tuple[str, str]]:
+def _strange_poses(file: DataFile) -> Iterator[tuple[str, str]]:
     """Names of what should be poses and is not, and what they hold, at the top and one level down."""
     top = file.content if isinstance(file.content, dict) else {}
     nested = {
@@ -317,7 +348,18 @@ def strange_poses(file: DataFile) -> Iterator[tuple[str, str]]:
             yield str(name), f"an unreadable array ({error})"
 
 
-def wanted_names() -> str:
+def no_bodies(file: DataFile) -> InputError:
+    """What a file holds that has no pose to read: a pose of a shape that is none's, or other names."""
+    name, reason = next(_strange_poses(file), ("pose", f"only the keys {shown_names(file)}"))
+    return InputError(
+        f"{file.path}: {name}", got=reason,
+        expected="72 values (smpl), 156 (smplh) or 165 (smplx) a frame, or as many joints as matrices, "
+        f"quaternions or 6D; keys: {_wanted_names()}",
+        fix="Rename the keys, or convert another file.",
+    )  # fmt: skip
+
+
+def _wanted_names() -> str:
     """Names of parts that are looked for, for a refusal."""
     shown = ("pose", "root", "body", "trans", "betas")
     return "; ".join(f"{part}: {', '.join(PARTS[part][:5])}" for part in shown)

@@ -21,11 +21,11 @@ from soma_core.io.smpl_bodies import (
     choose_body,
     find_bodies,
     holds_poses,
+    no_bodies,
     people_in,
     shown_names,
-    strange_poses,
-    wanted_names,
 )
+from soma_core.io.smpl_camera import camera_beside, in_world
 from soma_core.io.smpl_names import RATES
 from soma_core.io.smpl_parts import BodyParts
 from soma_core.io.smpl_pose import SmplPose, read_pose
@@ -151,21 +151,13 @@ def read_smpl(path: str | Path, choices: SmplChoices | None = None) -> SmplMotio
     with open_data(path) as file:
         bodies = find_bodies(file)
         if not bodies:
-            raise _without_bodies(file)
-        body = choose_body(file, bodies, person=choices.person, space=choices.coordinates)
+            raise no_bodies(file)
+        camera, space = camera_beside(file, bodies), choices.coordinates
+        if camera is not None and space == "world":
+            space = None  # by the path of the camera
+        body = choose_body(file, bodies, person=choices.person, space=space)
         _say_choice(file, bodies, body)
-        return _Reading(file, body, choices).motion()
-
-
-def _without_bodies(file: DataFile) -> InputError:
-    """What a file holds that has no pose to read: a pose of a shape that is none's, or other names."""
-    name, reason = next(strange_poses(file), ("pose", f"only the keys {shown_names(file)}"))
-    return InputError(
-        f"{file.path}: {name}", got=reason,
-        expected="72 values (smpl), 156 (smplh) or 165 (smplx) a frame, or as many joints as matrices, "
-        f"quaternions or 6D; keys: {wanted_names()}",
-        fix="Rename the keys, or convert another file.",
-    )  # fmt: skip
+        return _Reading(file, body, choices, None if space == "camera" else camera).motion()
 
 
 def _say_choice(file: DataFile, bodies: Sequence[FoundBody], body: FoundBody) -> None:
@@ -195,8 +187,8 @@ def _lasts(frames: int, rate: float, seconds: float) -> bool:
 class _Reading:
     """One body of a file on its way to a motion."""
 
-    def __init__(self, file: DataFile, body: FoundBody, choices: SmplChoices) -> None:
-        self._file, self._body, self._choices = file, body, choices
+    def __init__(self, file: DataFile, body: FoundBody, choices: SmplChoices, camera: Path | None) -> None:
+        self._file, self._body, self._choices, self._camera = file, body, choices, camera
         self._parts = BodyParts(file, body)
         self._tool = body.tool
 
@@ -209,13 +201,19 @@ class _Reading:
         whole = np.isfinite(pose.rotations).all(axis=(1, 2)) & np.isfinite(translation).all(axis=1)
         unseen = "trans" if np.isfinite(pose.rotations).all() and "trans" in self._parts else pose.leading
         rows, times = kept_frames(whole, numbers, self._parts.where(unseen))
-        moving = np.concatenate([translation, pose.hands], axis=1)[rows]
-        rotations, moving = self._without_gaps(pose.rotations[rows], moving, times, fps, len(whole))
+        turned, path = pose.rotations[rows], translation[rows]
+        if self._camera is not None:
+            turned, path = in_world(self._camera, turned, path, rows if numbers is None else numbers[rows])
+            _log.info("%s: in the world by %s; or coordinates=camera", self._file.path.name, self._camera)
+        moving = np.concatenate([path, pose.hands[rows]], axis=1)
+        turned, moving = self._without_gaps(turned, moving, times, fps, len(whole))
+        rotations = turned[:, : pose.rotations.shape[1]]
         flat = choices.flat_hand_mean
         return SmplMotion(
             model=pose.model, rotations=rotations, translation=moving[:, :3], betas=self._betas(pose),
             gender=self._gender(), fps=fps, up=self._up(rotations),
             about=self._tool.about if self._tool else "pelvis",
+            camera_turns=None if self._camera is None else turned[:, -1],
             flat_hands=self._parts.flag("flat", default=not pose.hands.size) if flat is None else flat,
             hand_components=moving[:, 3:],
             source=self._file.path.name,
@@ -328,6 +326,10 @@ class _Reading:
                 fix=f"Pass betas=[{','.join('0' * 10)}] for the mean shape, or the true ones.",
             )  # fmt: skip
         rows = self._parts.betas(pose.frames)
+        most = self._tool.most_betas if self._tool else None
+        if most is not None and rows.shape[1] > most:
+            self._say("shapes of %d numbers: those behind the first %d are not read", rows.shape[1], most)
+            rows = rows[:, :most]
         rows = rows[np.isfinite(rows).all(axis=1)]
         if not len(rows):
             raise self._parts.refuse(
@@ -381,7 +383,7 @@ class _Reading:
         """Upward axis: as asked for, of a camera, of the tool's world, or how the body stands."""
         if self._choices.up:
             return self._choices.up
-        if self._body.space == "camera":
+        if self._body.space == "camera" and self._camera is None:
             _log.info("%s: camera axes, +y down: turned upright; up= for another axis", self._file.path.name)
             return "-y"
         if self._tool is None:

@@ -22,8 +22,8 @@ PARTS: dict[str, tuple[str, ...]] = {
     ),
     "body": ("body_pose", "pose_body", "poses_body", "body_rotmat"),
     "hands": ("pose_hand", "hand_pose", "hands_pose", "poses_hand", "pose_hands"),
-    "left_hand": ("left_hand_pose", "pose_lhand", "lhand_pose", "poses_lhand", "left_hand"),
-    "right_hand": ("right_hand_pose", "pose_rhand", "rhand_pose", "poses_rhand", "right_hand"),
+    "left_hand": ("left_hand_pose", "handl", "pose_lhand", "lhand_pose", "poses_lhand", "left_hand"),
+    "right_hand": ("right_hand_pose", "handr", "pose_rhand", "rhand_pose", "poses_rhand", "right_hand"),
     "jaw": ("jaw_pose", "pose_jaw", "poses_jaw"),
     "eyes": ("pose_eye", "eye_pose", "eyes_pose"),
     "left_eye": ("leye_pose", "left_eye_pose", "pose_leye"),
@@ -101,6 +101,8 @@ class Tool:
         gender: of the bodies, where the file does not say.
         no_betas: whether the mean shape is meant where there are none.
         about: what the root rotation turns about.
+        most_betas: that are its model's shape; those behind mean something else.
+        camera: name of the file beside its own, or above, that has the path of the camera.
     """
 
     name: str
@@ -111,6 +113,8 @@ class Tool:
     gender: str | None = None
     no_betas: bool = False
     about: Literal["pelvis", "origin"] = "pelvis"
+    most_betas: int | None = None
+    camera: str = ""
 
 
 TOOLS = (
@@ -124,7 +128,14 @@ TOOLS = (
     Tool(name="WHAM", keys=("pose", "trans", "frame_ids", "verts"), fps=30, gender="neutral", space="camera"),
     Tool(name="VIBE", keys=("orig_cam", "pose"), fps=30, gender="neutral", space="camera"),
     Tool(name="4D-Humans", keys=("tracks",), fps=30, gender="neutral", space="camera"),
-    Tool(name="TRAM", keys=("pred_rotmat", "pred_shape"), fps=30, gender="neutral", space="camera"),
+    Tool(
+        name="TRAM",
+        keys=("pred_rotmat", "pred_shape"),
+        fps=30,
+        gender="neutral",
+        space="camera",
+        camera="camera.npy",
+    ),
     Tool(name="3DPW", keys=("poses", "genders", "cam_poses"), fps=30, up="+y"),
     Tool(name="EMDB", keys=("poses_root", "poses_body"), fps=30, up="+y"),
     Tool(name="AIST++", keys=("smpl_poses", "smpl_scaling"), fps=60, up="+y", gender="male", no_betas=True),
@@ -135,7 +146,14 @@ TOOLS = (
     Tool(name="Motion-X", keys=("motion_x_322",), fps=30, up="+y", gender="neutral"),
     Tool(name="Inter-X", keys=("pose_lhand", "pose_rhand")),
     Tool(name="TRACE", keys=("smpl_thetas", "world_trans"), fps=30, gender="neutral"),
-    Tool(name="ROMP", keys=("smpl_thetas", "cam_trans"), fps=30, gender="neutral", space="camera"),
+    Tool(
+        name="ROMP or BEV",
+        keys=("smpl_thetas", "cam_trans"),
+        fps=30,
+        gender="neutral",
+        space="camera",
+        most_betas=10,
+    ),
     Tool(name="SLAHMR", keys=("root_orient", "pose_body", "cam_R"), fps=30, gender="neutral"),
     Tool(name="the smplx library", keys=("global_orient", "body_pose"), gender="neutral"),
 )

@@ -91,8 +91,9 @@ class _Reader:
         elif not apart and "root" in self._parts and np.abs(values[:, 0]).max() < _STILL:
             values = np.concatenate([self._part("root", 1), values[:, 1:]], axis=1)  # as EasyMocap has it
         found = _grouped(values)
+        whole = {*found} if leading == "pose" else set()
         for part, (group, start, count) in (_SIDED | _FACES).items():
-            if part in self._parts and not (leading == "pose" and group in found):
+            if part in self._parts and group not in whole:
                 self._add(found, part, group, slice(start, start + count))
         return found, leading
 

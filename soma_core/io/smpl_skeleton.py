@@ -78,7 +78,7 @@ def smpl_skeleton(motion: SmplMotion, rig: Rig) -> SkeletonMotion:
         parents=np.array(parents),
         rest=np.array(rest),
         rotations=rotations,
-        root=motion.translation.astype(np.float64) + rest[0],
+        root=motion.about_pelvis(rest[0]).astype(np.float64) + rest[0],
         fps=motion.fps,
         up=motion.up,
         metres=1.0,

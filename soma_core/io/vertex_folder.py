@@ -11,7 +11,7 @@ from soma_core.errors import InputError
 from soma_core.io.mesh_vertices import read_mesh_vertices
 from soma_core.io.vertex_sequence import VertexSequence
 
-__all__ = ["FolderSequence"]
+__all__ = ["FolderSequence", "natural"]
 
 _SUFFIXES = (".obj", ".ply")
 
@@ -37,7 +37,7 @@ class FolderSequence(VertexSequence):
                 expected="meshes of one kind, one a frame",
                 fix="Put the frames into a folder of their own.",
             )
-        self._files = sorted(files, key=_natural)
+        self._files = sorted(files, key=natural)
         super().__init__(path, len(self._files), len(read_mesh_vertices(self._files[0])))
 
     def _read(self, start: int, stop: int) -> np.ndarray:
@@ -55,7 +55,7 @@ class FolderSequence(VertexSequence):
         return vertices
 
 
-def _natural(file: Path) -> list[tuple[int, int | str]]:
+def natural(file: Path) -> list[tuple[int, int | str]]:
     """Sorting key in which numbers count as numbers."""
     parts = re.split(r"([0-9]{1,18})", file.name)  # other digits, such as ², are no numbers to Python
     return [(0, int(part)) if part.isascii() and part.isdigit() else (1, part) for part in parts if part]

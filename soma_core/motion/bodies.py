@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from soma_core.errors import AssetError, InputError
 from soma_core.io.amass import SmplMotion
@@ -230,10 +229,9 @@ def _model_pose(
             )  # fmt: skip
         rotations = rotations.copy()
         rotations[:, -30:] += mean
-    if motion.about == "origin":
-        pelvis = backend.rest_joints(params)[0]
-        translation = translation + Rotation.from_rotvec(rotations[:, 0]).apply(pelvis) - pelvis
-    return {"rotations": rotations, "translation": translation.astype(np.float32)}
+    if motion.about == "origin" or motion.camera_turns is not None:
+        translation = motion.about_pelvis(backend.rest_joints(params)[0])
+    return {"rotations": rotations, "translation": translation}
 
 
 def _fingers(path: Path, motion: SmplMotion, backend: FitBackend) -> tuple[np.ndarray | None, bool]:

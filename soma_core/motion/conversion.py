@@ -16,6 +16,7 @@ from typing import Any
 from soma_core.cache import atomic_text
 from soma_core.choices import FitLod, LengthUnit
 from soma_core.errors import InputError, SomaError
+from soma_core.io.json_frames import holds_pose_frames
 from soma_core.io.motion import Motion
 from soma_core.io.motion_files import samples_of
 from soma_core.io.smpl_files import people_of
@@ -284,11 +285,12 @@ def _converter(options: ConvertOptions, *, refuse_unused: bool = True) -> Conver
 
 
 def _files(folder: Path) -> Iterator[Path]:
-    """Files that may hold a motion, hidden ones apart, in the order of their names."""
+    """Files that may hold a motion, and folders of JSON frames, hidden ones apart, by their names."""
     suffixes = motion_suffixes()
     for file in sorted(folder.resolve().rglob("*")):
         hidden = any(part.startswith(".") for part in file.relative_to(folder.resolve()).parts)
-        if file.suffix.lower() in suffixes and not hidden and file.is_file():
+        known = file.suffix.lower() in suffixes and file.is_file()
+        if not hidden and (known or holds_pose_frames(file)):
             yield file
 
 

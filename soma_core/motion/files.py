@@ -12,6 +12,7 @@ from soma_core.choices import LengthUnit, Product
 from soma_core.errors import InputError, SomaError
 from soma_core.io.data_files import DATA_SUFFIXES, open_data
 from soma_core.io.gem_x import gem_x_parts, gem_x_result
+from soma_core.io.json_frames import holds_pose_frames
 from soma_core.io.motion import Convention, Motion
 from soma_core.io.motion_files import read_motion, write_motion
 from soma_core.io.npz_fields import open_npz
@@ -108,6 +109,8 @@ def layout_of(path: str | Path) -> Layout | str | None:
         AssetError: the file is missing, damaged, a git-LFS pointer or not what its suffix says.
     """
     path = expanded(path)
+    if path.is_dir():
+        return "smpl" if holds_pose_frames(path) else None
     known = path.suffix.lower() in SUFFIXES
     return (_known_layout(path) if known else None) or _plugin_format(path) or _known_layout(path)
 

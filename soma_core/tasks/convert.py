@@ -17,6 +17,7 @@ from soma_core.motion.conversion import (
     convert_folder,
     convert_people,
 )
+from soma_core.motion.files import layout_of
 from soma_core.paths import expanded
 
 if TYPE_CHECKING:
@@ -44,7 +45,7 @@ def run(config: DictConfig, output: Path) -> None:
     if not path.exists():
         raise AssetError(path, cause="file is missing", fix="Check the path.")
     try:
-        if path.is_dir() and not (options.points and is_one(path, views=options.camera is not None)):
+        if path.is_dir() and not _is_one(path, options):
             _say(path, convert_folder(path, output, options=options), output / "report.json")
         elif options.person == EVERYONE:
             for person, converted in convert_people(path, output, options=options).items():
@@ -56,6 +57,13 @@ def run(config: DictConfig, output: Path) -> None:
     except KeyboardInterrupt:
         _log.warning("stopped; the same command with out=%s goes on from here", output)
         raise
+
+
+def _is_one(folder: Path, options: ConvertConfig) -> bool:
+    """Whether a folder is one motion, with a file a frame or a view."""
+    if options.points:
+        return is_one(folder, views=options.camera is not None)
+    return layout_of(folder) is not None
 
 
 def _say(folder: Path, found: FolderConverted, report: Path) -> None:

@@ -18,11 +18,14 @@ from soma_backend_smpl.family import SMPL
 from assets.make.twist_template import procedural_document
 from soma_core.backends.native import component_count
 from soma_core.correctives.weights import read_weights
+from soma_core.errors import InputError
 from soma_core.io import open_vertex_sequence, read_amass, read_motion, read_smpl
+from soma_core.io.json_frames import read_pose_frames
 from soma_core.io.mesh_vertices import read_mesh_vertices, read_ply_triangles
 from soma_core.io.pickled_arrays import read_pickled_arrays
 from soma_core.io.sam3d import read_sam3d
 from soma_core.io.skeleton_files import read_skeleton
+from soma_core.io.smpl_camera import in_world
 from soma_core.io.torch_file import read_torch_arrays
 from soma_core.obj import read_obj
 from soma_core.rig.manifest import MANIFEST_NAME, read_manifest
@@ -32,7 +35,7 @@ from soma_core.rig.usd import read_usd_rig
 from soma_core.tasks.wrap import read_landmarks
 from tests.fbx_files import write_fbx
 from tests.io.smpl_layouts import TURNS as SMPLX_TURNS
-from tests.io.smpl_layouts import save_joblib, save_npy, save_npz, save_pt, smplx_names, wham
+from tests.io.smpl_layouts import easymocap, save_joblib, save_npy, save_npz, save_pt, smplx_names, wham
 from tests.skeletons import glb_bytes, moved
 from tests.standins.pickles import ch, csc, select, write_pickle
 
@@ -70,6 +73,34 @@ def _folder(path: Path) -> np.ndarray:
     inside.unlink(missing_ok=True)
     inside.symlink_to(path)
     return _frames(folder)
+
+
+def _beside(path: Path, name: str) -> Path:
+    """A folder that holds the file alone, under a name."""
+    folder = path.with_suffix(".d")
+    folder.mkdir(exist_ok=True)
+    (folder / name).unlink(missing_ok=True)
+    (folder / name).symlink_to(path)
+    return folder
+
+
+def _pose_frames(path: Path) -> object:
+    people = read_pose_frames(_beside(path, path.name))
+    if not people:
+        raise InputError(str(path), got="nobody", expected="people", fix="Look.")
+    return people
+
+
+def _pose_frame(path: Path) -> None:
+    path.write_text(json.dumps(easymocap(72)[0]))
+
+
+def _camera(path: Path) -> object:
+    return in_world(path, np.zeros((2, 24, 3)), np.zeros((2, 3)), np.arange(2))
+
+
+def _camera_path(path: Path) -> None:
+    save_npy(path, {"pred_cam_R": np.tile(np.eye(3), (2, 1, 1)), "pred_cam_T": np.zeros((2, 3))})
 
 
 def _manifest(path: Path) -> object:
@@ -356,6 +387,8 @@ READERS = [
         read=read_smpl,
         good=lambda path: save_joblib(path, {0: wham()[0]}),
     ),
+    Reader(name="pose frames", suffix=".json", read=_pose_frames, good=_pose_frame),
+    Reader(name="camera of tracks", suffix=".npy", read=_camera, good=_camera_path),
     Reader(name="sam 3d body", suffix=".npz", read=read_sam3d),
     Reader(name="shape space", suffix=".npz", read=load_shape_space, good=_shape_space),
     Reader(

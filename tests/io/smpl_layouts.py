@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import pickle
 import zlib
 from collections.abc import Callable
@@ -52,6 +53,13 @@ def tensors(content: Any) -> Any:
 def save_npz(path: Path, content: dict[str, Any]) -> None:
     """As numpy does, objects included."""
     np.savez(path, **content)
+
+
+def save_frames(path: Path, content: list[Any]) -> None:
+    """As EasyMocap does: a folder with a JSON file a frame."""
+    path.mkdir()
+    for number, frame in enumerate(content):
+        (path / f"{number:06d}.json").write_text(json.dumps(frame))
 
 
 def save_npy(path: Path, content: Any) -> None:
@@ -130,6 +138,45 @@ def phalp() -> dict[str, Any]:
             "mask": [{"size": [1, 1], "counts": b"0"}],
         }
     return found
+
+
+def romp() -> dict[str, Any]:
+    """Images with the people in each, and the same by their tracks; the second comes and goes."""
+    images, tracks = {}, {}
+    for number in range(FRAMES):
+        people = [3] if number == 2 else [8, 3]
+        image = {
+            "smpl_thetas": np.stack([flat(SMPL)[number] + (person == 8) for person in people]),
+            "smpl_betas": np.tile(np.append(BETAS, 0.5), (len(people), 1)),  # BEV's eleventh tells children
+            "cam": np.ones((len(people), 3)),
+            "cam_trans": np.tile(PATH[number], (len(people), 1)),
+            "track_ids": np.array(people, np.int32),
+        }
+        images[f"{number:08d}.png"] = image
+        for place, person in enumerate(people):
+            track = tracks.setdefault(np.int32(person), {"frame_id": []})
+            track["frame_id"].append(number)
+            for name, values in image.items():
+                track.setdefault(name, []).append(values[place])
+    return {"results": images, "sequence_results": tracks}
+
+
+def easymocap(width: int) -> list[list[dict[str, Any]]]:
+    """Frames with the people in each; the second is seen in the last alone."""
+    poses = flat(np.concatenate([np.zeros((FRAMES, 1, 3)), SMPL[:, 1:]], axis=1))
+    hands_and_face = np.concatenate([np.zeros((FRAMES, 12)), flat(TURNS[:, 22:25])], axis=1)
+    poses = np.concatenate([poses[:, :66], hands_and_face], axis=1) if width == 87 else poses
+    one = [
+        {
+            "id": 4,
+            "Rh": SMPL[number, :1].tolist(),
+            "Th": PATH[number : number + 1].tolist(),
+            "poses": poses[number : number + 1].tolist(),
+            "shapes": [BETAS.tolist()],
+        }
+        for number in range(FRAMES)
+    ]
+    return [[person, *([person | {"id": 9}] * (person is one[-1]))] for person in one]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -419,6 +466,54 @@ LAYOUTS = [
             "Rh": SMPL[:, 0],
             "Th": PATH,
             "shapes": BETAS[None],
+        },
+    ),
+    Layout(
+        name="EasyMocap's folder",
+        suffix="",
+        save=save_frames,
+        model="smpl",
+        turns=SMPL,
+        about="origin",
+        choices={"person": "4"},
+        people=2,
+        content=lambda: easymocap(72),
+    ),
+    Layout(
+        name="EasyMocap's folder, SMPL-X",
+        suffix="",
+        save=save_frames,
+        turns=np.concatenate([TURNS[:, :25], np.zeros((FRAMES, 30, 3))], axis=1),
+        about="origin",
+        choices={"person": "4"},
+        people=2,
+        content=lambda: [{"annots": people} for people in easymocap(87)],
+    ),
+    Layout(
+        name="BEV, a video",
+        suffix=".npz",
+        save=save_npz,
+        model="smpl",
+        turns=SMPL,
+        up="-y",
+        choices={"person": "3"},
+        people=2,
+        content=romp,
+    ),
+    Layout(
+        name="ROMP, an image of two",
+        suffix=".npz",
+        save=save_npz,
+        model="smpl",
+        turns=SMPL[:1],
+        path=PATH[:1],
+        up="-y",
+        choices={"person": "1"},
+        people=2,
+        content=lambda: {
+            "results": {
+                key: value for key, value in romp()["results"]["00000000.png"].items() if key != "track_ids"
+            }
         },
     ),
     Layout(

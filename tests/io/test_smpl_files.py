@@ -10,6 +10,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from soma_core.errors import AssetError, InputError
+from soma_core.io.amass import SmplMotion
 from soma_core.io.smpl_files import SmplChoices, people_of, read_smpl, smpl_layout
 from tests.io.smpl_layouts import (
     BETAS,
@@ -19,8 +20,11 @@ from tests.io.smpl_layouts import (
     PATH,
     SMPL,
     TURNS,
+    easymocap,
     flat,
     matrices,
+    save_frames,
+    save_npy,
     save_npz,
     save_pickle,
     six,
@@ -309,3 +313,111 @@ def test_compressed_files_of_joblib_are_read(tmp_path, method):
 
 def test_one_row_of_shapes_is_not_each_frame_s(tmp_path):
     assert read(tmp_path, smplx_names(TURNS, betas=MANY[:1])).betas.tolist() == pytest.approx(BETAS)
+
+
+@pytest.mark.parametrize("about", ["pelvis", "origin"])
+def test_a_root_about_another_point_moves_every_point_alike(about):
+    """By the definition: points turn about the origin, or turn about the pelvis before the camera does."""
+    random, pelvis = np.random.default_rng(5), np.array([0.01, -0.3, 0.02])
+    point, turns = random.standard_normal(3), random.standard_normal((FRAMES, 24, 3))
+    camera = random.standard_normal((FRAMES, 3))
+    root, seen = Rotation.from_rotvec(turns[:, 0]), Rotation.from_rotvec(camera)
+    if about == "pelvis":
+        expected = seen.apply(root.apply(point - pelvis) + pelvis + PATH) + 1.0
+        turns[:, 0], path = (seen * root).as_rotvec(), seen.apply(PATH) + 1.0
+    else:
+        expected, path = root.apply(point) + PATH, PATH
+    motion = SmplMotion(
+        model="smpl", rotations=turns, translation=path, betas=BETAS, gender="neutral", fps=30, about=about,
+        camera_turns=camera if about == "pelvis" else None,
+    )  # fmt: skip
+    placed = Rotation.from_rotvec(turns[:, 0]).apply(point - pelvis) + pelvis + motion.about_pelvis(pelvis)
+    np.testing.assert_allclose(placed, expected, atol=SINGLE)
+
+
+def tram(tmp_path, **camera):
+    """A track, seen in all frames but the second, beside the path of a camera."""
+    seen = np.delete(np.arange(FRAMES), 1)
+    (tmp_path / "hps").mkdir(exist_ok=True)
+    path = tmp_path / "hps" / "hps_track_0.npy"
+    content = {"pred_rotmat": matrices(SMPL)[seen], "pred_shape": MANY[seen], "pred_trans": PATH[seen, None]}
+    save_npy(path, content | {"pred_cam": np.ones((len(seen), 3)), "frame": seen})
+    turns = Rotation.from_rotvec(np.linspace([0, 0, 0], [0.2, 0.4, -0.1], FRAMES))
+    content = {"pred_cam_R": turns.as_matrix(), "pred_cam_T": PATH[::-1], "img_focal": np.array(500.0)}
+    save_npy(tmp_path / "camera.npy", content | camera)
+    return path, turns, seen
+
+
+def test_a_camera_beside_tram_s_tracks_brings_them_into_the_world(tmp_path, caplog):
+    caplog.set_level(logging.INFO)
+    path, turns, seen = tram(tmp_path)
+    found = read_smpl(path)
+    assert "in the world by" in caplog.text
+    same_turns(found.rotations[seen, 0], (turns[seen] * Rotation.from_rotvec(SMPL[seen, 0])).as_rotvec())
+    same_turns(found.rotations[seen, 1:], SMPL[seen, 1:])
+    np.testing.assert_allclose(
+        found.translation[seen], turns[seen].apply(PATH[seen]) + PATH[::-1][seen], atol=SINGLE
+    )
+    same_turns(found.camera_turns[seen], turns[seen].as_rotvec())
+    before = read_smpl(path, SmplChoices(coordinates="camera"))
+    same_turns(before.rotations[seen], SMPL[seen])
+    assert before.camera_turns is None
+    assert before.up == "-y"
+    assert read_smpl(path, SmplChoices(coordinates="world")).camera_turns is not None
+
+
+@pytest.mark.parametrize(
+    ("camera", "said"),
+    [
+        ({"pred_cam_R": np.ones((FRAMES, 3, 3))}, "RᵀR"),
+        ({"pred_cam_R": np.zeros((FRAMES, 4))}, "shapes"),
+        (
+            {"pred_cam_R": np.tile(np.eye(3), (2, 1, 1)), "pred_cam_T": PATH[:2]},
+            "2 frames, and a motion up to frame 4",
+        ),
+        ({"pred_cam_T": np.full((FRAMES, 3), np.nan)}, "NaN"),
+        ({"pred_cam_T": "far"}, "camera.npy"),
+    ],
+)
+def test_a_camera_that_is_none_is_refused_by_its_name(tmp_path, camera, said):
+    path, *_ = tram(tmp_path, **camera)
+    with pytest.raises(InputError, match=said) as caught:
+        read_smpl(path)
+    assert "camera.npy" in str(caught.value)
+    assert "coordinates=camera" in str(caught.value)
+
+
+def frames(tmp_path, **changes):
+    """A folder of three frames, the last of which is changed."""
+    people = [frame[:1] for frame in easymocap(72)][:3]
+    people[2] = [people[2][0] | changes]
+    save_frames(tmp_path / "smpl", people)
+    return tmp_path / "smpl"
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"poses": [[0.0] * 69]}, r"000002\.json: person 4.*69 poses"),
+        ({"Th": "here"}, r"000002\.json: Th.*numbers"),
+        ({"shapes": [[0.0] * 5000]}, r"000002\.json: shapes.*5000"),
+        ({"Rh": [[1e999, 0, 0]]}, None),
+    ],
+)
+def test_frames_that_are_none_are_refused_by_their_file(tmp_path, changes, said):
+    folder = frames(tmp_path, **changes)
+    if said is None:  # what is not finite is a gap, as in other files: here at the end
+        assert read_smpl(folder).frame_count == 2
+        return
+    with pytest.raises(InputError, match=said):
+        read_smpl(folder)
+
+
+def test_numbers_in_the_names_of_frames_are_time(tmp_path):
+    folder = frames(tmp_path)
+    (folder / "000002.json").rename(folder / "000004.json")
+    assert read_smpl(folder).frame_count == 5
+    assert smpl_layout(folder) == "smpl"
+    (folder / "000000.json").write_text("{")
+    with pytest.raises(AssetError, match=r"000000\.json: not valid JSON"):
+        read_smpl(folder)

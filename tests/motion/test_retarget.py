@@ -174,7 +174,9 @@ def test_soles_are_as_flat_as_there(along, higher, rig):
     apart = bones_apart(along_axes(source) if along else source, found, rig)
     assert max(angle for name, angle in apart.items() if "Toe" not in name) < SAME_DEGREES
     told = found.report["foot_slopes_degrees"]
-    assert told == pytest.approx({"LeftFoot": apart["LeftToeBase"], "RightFoot": apart["RightToeBase"]}, abs=0.05)
+    assert told == pytest.approx(
+        {"LeftFoot": apart["LeftToeBase"], "RightFoot": apart["RightToeBase"]}, abs=0.05
+    )
 
 
 def test_feet_that_never_stand_flat_keep_their_bones(rig):
