@@ -271,8 +271,7 @@ def _cells(path: Path, number: int, row: Sequence[str], count: int) -> list[floa
 
 def _of_folder(path: Path, person: str | None, size: int) -> PointFrames:
     """A folder of OpenPose or EasyMocap: a JSON file a frame, by the order of their names."""
-    files = frame_files(path)
-    if not files:
+    if not (files := frame_files(path)):
         raise InputError(str(path), got="no .json in it", expected="a file a frame", fix="Name their folder.")
     frames = [_person(file, read_json(file, fix="Write it again."), person, size) for file in files]
     return _stacked(path, frames, "a folder with a file a frame", size)

@@ -87,13 +87,9 @@ def retarget(
     rotations = _local(goals, source.frame_count)
     path, scale, legs = _path(source, joints, turns, goals["Hips"], rest, carried=bool(own))
     motion = Motion(
-        rotations=rotations,
-        translation=path,
-        fps=source.fps,
-        joint_names=USER_JOINTS,
-        rig_revision=rig.revision,
-        source=source.source,
-    )
+        rotations=rotations, translation=path, fps=source.fps, joint_names=USER_JOINTS,
+        rig_revision=rig.revision, source=source.source,
+    )  # fmt: skip
     report = _joints_report(source, joints, spine, neck) | {
         "rest_pose": alignment.kind, "unit_metres": found.metres, "up": found.up, "legs_metres": legs,
         "path_scale": scale, "at_rest": [name for name in USER_JOINTS if name not in goals],
