@@ -268,4 +268,5 @@ def register_schemas() -> None:
     OmegaConf.register_new_resolver("soma_keys", _explained_keys, replace=True)
     store = ConfigStore.instance()
     for task, schema in SCHEMAS.items():
-        store.store(name=f"{task}_schema", node=schema)
+        if f"{task}_schema.yaml" not in store.repo:  # a schema takes milliseconds to make
+            store.store(name=f"{task}_schema", node=schema)

@@ -10,12 +10,16 @@ from typing import Any
 
 import numpy as np
 import torch
+from hydra import compose, initialize_config_dir
+from omegaconf import DictConfig
 from torch import Tensor
 
+from soma_core.config.schema import register_schemas
 from soma_core.errors import InputError
 from soma_core.layer import SomaLayer
 from soma_core.obj import read_obj
-from soma_core.plugin.discovery import Offer
+from soma_core.paths import configs_dir
+from soma_core.plugin.discovery import CORE_PACKAGE, Offer
 from soma_core.plugin.registry import Registry, default_registry
 from soma_core.plugin.spec import BackendSpec, Generator, Parameter
 from soma_core.rig import load_canonical
@@ -109,6 +113,23 @@ class Context:
     def import_probe(self) -> ImportProbe:
         """What declaring does in a fresh interpreter."""
         return probe_import(self.offer)
+
+    @functools.cached_property
+    def composed(self) -> DictConfig:
+        """Group ``backend`` as ``backend=<name>`` on the command line composes it."""
+        name, registry = self.name, self.registry
+        folders = [folder for _, folder in registry.config_dirs()]
+        clash = registry.config_clashes().get(f"backend/{name}.yaml")
+        if clash is not None:
+            raise clash
+        shipped = any((folder / "backend" / f"{name}.yaml").is_file() for folder in folders)
+        if self.offer.package != CORE_PACKAGE and not shipped:
+            raise registry.missing_config(name)
+        register_schemas()
+        paths = ", ".join(f"'file://{folder}'" for folder in folders)
+        with initialize_config_dir(version_base="1.3", config_dir=str(configs_dir())):
+            overrides = [f"backend={name}", f"hydra.searchpath=[{paths}]"]
+            return compose("animate", overrides=overrides).backend
 
     @property
     def spec(self) -> BackendSpec:

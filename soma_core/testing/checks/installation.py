@@ -4,14 +4,10 @@ from __future__ import annotations
 
 from typing import Any
 
-from hydra import compose, initialize_config_dir
 from hydra.errors import HydraException
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import OmegaConf
 
-from soma_core.config.schema import register_schemas
-from soma_core.paths import configs_dir
 from soma_core.plugin.checks import CheckFailedError, check
-from soma_core.plugin.discovery import CORE_PACKAGE
 from soma_core.plugin.options import checked_options, options_by_name
 from soma_core.testing.context import Context
 
@@ -53,24 +49,6 @@ def import_silent(context: Context) -> None:
         )
 
 
-def _composed(context: Context) -> DictConfig:
-    """Group ``backend`` as ``backend=<name>`` on the command line composes it."""
-    name, registry = context.name, context.registry
-    folders = [str(folder) for _, folder in registry.config_dirs()]
-    clash = registry.config_clashes().get(f"backend/{name}.yaml")
-    if clash is not None:
-        raise clash
-    if context.offer.package != CORE_PACKAGE and not any(
-        (folder / "backend" / f"{name}.yaml").is_file() for _, folder in registry.config_dirs()
-    ):
-        raise registry.missing_config(name)
-    register_schemas()
-    paths = ", ".join(f"'file://{folder}'" for folder in folders)
-    with initialize_config_dir(version_base="1.3", config_dir=str(configs_dir())):
-        overrides = [f"backend={name}", f"hydra.searchpath=[{paths}]"]
-        return compose("animate", overrides=overrides).backend
-
-
 @check(
     "config-composes", mend="add the file; its `name:` is the backend's", level="core", needs=("declares",)
 )
@@ -78,7 +56,7 @@ def config_composes(context: Context) -> None:
     """The package ships configs/backend/<name>.yaml, and hydra composes it."""
     where = f"configs/backend/{context.name}.yaml"
     try:
-        name = _composed(context).name
+        name = context.composed.name
     except HydraException as error:
         raise CheckFailedError(
             where,
@@ -100,7 +78,7 @@ def config_composes(context: Context) -> None:
 )
 def config_complete(context: Context) -> None:
     """The config lists every parameter and option, with the defaults of Python."""
-    config = OmegaConf.to_container(_composed(context))
+    config = OmegaConf.to_container(context.composed)
     assert isinstance(config, dict)
     options = options_by_name(checked_options(context.spec, {}))
     _compare(context, "params", config["params"], {item.name: item.default for item in context.spec.params})

@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import functools
+
 import torch
 
 from soma_core.plugin import Expressions, LinearBasis, SkinnedModel, axis_angle_to_matrix, read_obj
+
+read_obj = functools.cache(read_obj)  # a check builds many generators of one file
 
 
 class Specimen:
