@@ -566,6 +566,9 @@ def test_torch_and_warp_agree_on_real_bodies(backend, batch):
 # --- compilation ----------------------------------------------------------------------------------------
 
 
+SLOW_TORCH = pytest.param("torch", marks=pytest.mark.slow)  # its graph has some thousand operations
+
+
 @pytest.fixture
 def fresh_compiler():
     torch._dynamo.reset()
@@ -575,11 +578,11 @@ def fresh_compiler():
 
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::DeprecationWarning:torch")
-@pytest.mark.parametrize("form", ["axis-angle", "matrices"])
 @pytest.mark.parametrize("kernels", ["torch", "warp"])
-def test_compiles_without_graph_breaks(tiny, fresh_compiler, kernels, form):
+def test_compiles_without_graph_breaks(tiny, fresh_compiler, kernels):
+    """Of matrices; the gradients below are of axis-angles."""
     layer, given, (turns, place) = tiny(torch.float64, kernels), params(2), poses(2)
-    turns = turns if form == "axis-angle" else axis_angle_to_matrix(turns)
+    turns = axis_angle_to_matrix(turns)
 
     def run(shape, size, rotations, translation):
         return outputs(layer.pose(layer.identity({"shape": shape, "size": size}), rotations, translation))
@@ -591,7 +594,7 @@ def test_compiles_without_graph_breaks(tiny, fresh_compiler, kernels, form):
 
 
 @pytest.mark.filterwarnings("ignore::DeprecationWarning:torch")
-@pytest.mark.parametrize("kernels", ["torch", "warp"])
+@pytest.mark.parametrize("kernels", [SLOW_TORCH, "warp"])
 def test_compiled_gradients(tiny, fresh_compiler, kernels):
     layer, given, (turns, place) = tiny(torch.float64, kernels), params(2), poses(2)
 
@@ -606,7 +609,7 @@ def test_compiled_gradients(tiny, fresh_compiler, kernels):
 
 
 @pytest.mark.filterwarnings("ignore::DeprecationWarning:torch")
-@pytest.mark.parametrize("kernels", ["torch", "auto"])
+@pytest.mark.parametrize("kernels", [SLOW_TORCH, "auto"])
 def test_compiles_for_batches_that_eager_cuts_into_parts(tiny, fresh_compiler, kernels):
     layer, given, (turns, place) = (
         tiny(torch.float32, kernels),

@@ -330,6 +330,7 @@ READERS = [
         suffix=".usda",
         read=_frames,
         good=_usd,
+        apart=True,
         accepts=(
             "usda of a repeated joint",
             "usda of faces out of range",
@@ -363,6 +364,7 @@ READERS = [
         suffix=".usda",
         read=read_skeleton,
         good=_usd,
+        apart=True,
         accepts=(
             "usda of joint indices out of range",
             "usda of negative joint indices",
@@ -399,7 +401,7 @@ READERS = [
         accepts=("npz of invalid text",),
     ),
     Reader(name="topology", suffix=".npz", read=read_topology),
-    Reader(name="usd rig", suffix=".usda", read=read_usd_rig, good=_usd),
+    Reader(name="usd rig", suffix=".usda", read=read_usd_rig, good=_usd, apart=True),
     Reader(name="procedural definition", suffix=".json", read=read_procedural, good=_procedural),
     Reader(name="manifest", suffix=".json", read=_manifest, good=_json),
     Reader(

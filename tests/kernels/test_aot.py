@@ -25,6 +25,7 @@ ARCHITECTURE = 80
 FOLDER = Path(soma_core.kernels.__file__).parent
 ROOT = FOLDER.parents[1]
 FILES = sorted(FOLDER.glob("*_wp.py"))
+LONG = {"pose_solver_wp": pytest.mark.slow}
 
 CPU_ONLY = {"descent_wp.descent": "a GPU takes the steps of a descent one by one, with blocks for patches"}
 """Kernels without a version for CUDA, as ``file_wp.kernel``, and why it takes another one there."""
@@ -87,7 +88,9 @@ def _compiler():
         pytest.skip("this build of Warp has no compiler for CUDA")
 
 
-@pytest.mark.parametrize("path", FILES, ids=lambda path: path.stem)
+@pytest.mark.parametrize(
+    "path", [pytest.param(path, marks=LONG.get(path.stem, ()), id=path.stem) for path in FILES]
+)
 def test_compiles_for_cuda(path, tmp_path):
     made = made_kernels(importlib.import_module(f"soma_core.kernels.{path.stem}"))
     covered = {line for name, line in map(line_of, made) if name == str(path)}
