@@ -15,6 +15,8 @@ __all__ = [
     "Contacts",
     "ConvertResult",
     "Coordinates",
+    "DatasetOutput",
+    "Engine",
     "EulerOrder",
     "FitLod",
     "Gallery",
@@ -286,3 +288,17 @@ class EulerOrder(StrEnum):
     YZX = "YZX"
     ZXY = "ZXY"
     ZYX = "ZYX"
+
+
+class Engine(StrEnum):
+    """What spreads the files of a conversion: processes of this machine, or Ray's actors on any number."""
+
+    local = "local"
+    ray = "ray"
+
+
+class DatasetOutput(StrEnum):
+    """How the converted motions of a folder are kept: a file each, or rows of Parquet shards."""
+
+    folder = "folder"
+    parquet = "parquet"

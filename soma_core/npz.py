@@ -120,6 +120,24 @@ class NpzFile:
             raise ValueError(f"{len(data)} bytes for the shape {header.shape} of {header.dtype}")
         return np.ndarray(header.shape, header.dtype, data, order="F" if header.fortran else "C")
 
+    def pieces(self, name: str, count: int) -> Iterator[np.ndarray]:
+        """Array under `name` in consecutive pieces of at most `count` entries; one is in memory at a time.
+
+        Raises:
+            ValueError: damaged, Python objects, or stored with the first axis last.
+        """
+        with self._open(name) as stream:
+            header = read_array_header(stream)
+            if header.fortran or not header.shape:
+                raise ValueError(f"the shape {header.shape}, which has no pieces")
+            size = header.dtype.itemsize * math.prod(header.shape[1:])
+            for start in range(0, header.shape[0], count):
+                shape = (min(count, header.shape[0] - start), *header.shape[1:])
+                data = stream.read(shape[0] * size)
+                if len(data) != shape[0] * size:
+                    raise ValueError(f"fewer bytes than the shape {header.shape} of {header.dtype}")
+                yield np.frombuffer(data, header.dtype).reshape(shape)
+
     def pickled(self, name: str) -> bytes:
         """The pickle that an array of Python objects under `name` is, which nothing here runs.
 

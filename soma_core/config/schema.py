@@ -20,7 +20,7 @@ from soma_core.choices import (
     Product,
     Translation,
 )
-from soma_core.motion.options import CleanOptions, ConvertOptions, InvertOptions
+from soma_core.motion.options import CleanOptions, DatasetOptions, InvertOptions
 from soma_core.motion.writers import WriteOptions, listed_writers
 from soma_core.options import BackendChoice, FrameRange, ModelOptions, Options, Picture, ViewOptions
 from soma_core.paths import configs_dir
@@ -98,7 +98,7 @@ class InvertConfig(InvertOptions):
 
 
 @dataclass(kw_only=True)
-class ConvertConfig(ConvertOptions):
+class ConvertConfig(DatasetOptions):
     """Configuration of ``soma convert``."""
 
     input: str | None = None

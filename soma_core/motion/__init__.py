@@ -22,23 +22,25 @@ if TYPE_CHECKING:
         smooth,
         without_spikes,
     )
-    from soma_core.motion.conversion import (
-        FolderConverted,
-        convert,
-        convert_file,
-        convert_folder,
-        convert_people,
-        load_clip,
-    )
+    from soma_core.motion.conversion import convert, convert_file, convert_people, load_clip
     from soma_core.motion.converter import Converted, finish_fit, invert, plan_fit
     from soma_core.motion.files import layout_of, read, write
     from soma_core.motion.fit_job import FitPlan, fit_chunks
+    from soma_core.motion.folder import FolderConverted, convert_folder
     from soma_core.motion.identities import stored_identity
-    from soma_core.motion.options import CleanOptions, ConvertOptions, FitOptions, InvertOptions, LimbSeconds
+    from soma_core.motion.options import (
+        CleanOptions,
+        ConvertOptions,
+        DatasetOptions,
+        FitOptions,
+        InvertOptions,
+        LimbSeconds,
+    )
     from soma_core.motion.played import Played
     from soma_core.motion.products import write_body, write_products
     from soma_core.motion.quality import motion_quality
     from soma_core.motion.retarget import retarget
+    from soma_core.motion.shards import ShardsConverted, convert_dataset, convert_shards
     from soma_core.motion.writers import WriteOptions
     from soma_core.options import BackendChoice, FrameRange, IdentityChoice, InversionChoice, Picture
 
@@ -49,6 +51,7 @@ __all__ = [
     "Cleaned",
     "ConvertOptions",
     "Converted",
+    "DatasetOptions",
     "FitOptions",
     "FitPlan",
     "FolderConverted",
@@ -59,14 +62,17 @@ __all__ = [
     "LimbSeconds",
     "Picture",
     "Played",
+    "ShardsConverted",
     "SkeletonMotion",
     "WriteOptions",
     "animate",
     "clean",
     "convert",
+    "convert_dataset",
     "convert_file",
     "convert_folder",
     "convert_people",
+    "convert_shards",
     "finish_fit",
     "fit_chunks",
     "invert",
@@ -102,21 +108,16 @@ _HOMES = {
         "smooth",
         "without_spikes",
     ],
-    "soma_core.motion.conversion": [
-        "FolderConverted",
-        "convert",
-        "convert_file",
-        "convert_folder",
-        "convert_people",
-        "load_clip",
-    ],
+    "soma_core.motion.conversion": ["convert", "convert_file", "convert_people", "load_clip"],
     "soma_core.motion.converter": ["Converted", "finish_fit", "invert", "plan_fit"],
     "soma_core.motion.files": ["layout_of", "read", "write"],
     "soma_core.motion.fit_job": ["FitPlan", "fit_chunks"],
+    "soma_core.motion.folder": ["FolderConverted", "convert_folder"],
     "soma_core.motion.identities": ["stored_identity"],
     "soma_core.motion.options": [
         "CleanOptions",
         "ConvertOptions",
+        "DatasetOptions",
         "FitOptions",
         "InvertOptions",
         "LimbSeconds",
@@ -125,6 +126,7 @@ _HOMES = {
     "soma_core.motion.products": ["write_body", "write_products"],
     "soma_core.motion.quality": ["motion_quality"],
     "soma_core.motion.retarget": ["retarget"],
+    "soma_core.motion.shards": ["ShardsConverted", "convert_dataset", "convert_shards"],
     "soma_core.motion.writers": ["WriteOptions"],
     "soma_core.options": ["BackendChoice", "FrameRange", "IdentityChoice", "InversionChoice", "Picture"],
 }

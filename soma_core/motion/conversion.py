@@ -1,29 +1,22 @@
-"""Conversion of a file, or of a folder of them, to this skeleton and back."""
+"""Conversion of a file to this skeleton and back."""
 
 from __future__ import annotations
 
-import json
 import logging
 import re
-import shutil
 import tempfile
-import traceback
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import fields, replace
 from pathlib import Path
-from typing import Any
 
-from soma_core.cache import atomic_text
 from soma_core.choices import FitLod, LengthUnit
 from soma_core.errors import InputError, SomaError
-from soma_core.io.json_frames import holds_pose_frames
 from soma_core.io.motion import Motion
 from soma_core.io.motion_files import samples_of
 from soma_core.io.smpl_files import people_of
 from soma_core.motion.back import BackConverter
 from soma_core.motion.bodies import SMPL_LAYOUTS
 from soma_core.motion.converter import Converted, Converter
-from soma_core.motion.files import ResultFiles, layout_of, motion_suffixes, no_motion, read
+from soma_core.motion.files import ResultFiles, layout_of, read
 from soma_core.motion.options import ConvertOptions
 from soma_core.motion.poses import POSES, named_pose
 from soma_core.motion.questions import Names, of_motion, say
@@ -31,7 +24,15 @@ from soma_core.options import FrameRange, ModelOptions, Picture
 from soma_core.paths import expanded
 from soma_core.rig.manifest import shipped_file
 
-__all__ = ["FolderConverted", "convert", "convert_file", "convert_folder", "convert_people", "load_clip"]
+__all__ = [
+    "EVERYONE",
+    "convert",
+    "convert_file",
+    "convert_people",
+    "converter_for",
+    "load_clip",
+    "people_names",
+]
 
 EVERYONE = "all"
 """Value of the option ``person`` that means each of them."""
@@ -148,7 +149,7 @@ def convert_file(source: str | Path, out: str | Path, *, options: ConvertOptions
         InputError: it holds no motion, or was converted before with other settings.
     """
     out = Path(out)
-    convert = _converter(options or ConvertOptions())
+    convert = converter_for(options or ConvertOptions())
     return convert(expanded(source), ResultFiles.of_folder(out), out / "chunks")
 
 
@@ -169,11 +170,11 @@ def convert_people(
     convert = Converter(options or ConvertOptions())
     return {
         person: convert.of_person(person)(source, ResultFiles.of_folder(out / name), out / name / "chunks")
-        for person, name in _people(source).items()
+        for person, name in people_names(source).items()
     }
 
 
-def _people(source: Path) -> dict[str, str]:
+def people_names(source: Path) -> dict[str, str]:
     """Whose motions a file holds, and what their results are called; the only one has no name.
 
     Raises:
@@ -199,139 +200,6 @@ def _people(source: Path) -> dict[str, str]:
     )
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class FolderConverted:
-    """What became of the files of a folder, by their names in it.
-
-    Attributes:
-        converted: those that were converted, by this call or an earlier one.
-        errors: what was wrong with those that were not.
-        skipped: those that hold nothing of a motion; files with poses that cannot be read are errors.
-    """
-
-    converted: dict[str, Converted] = field(default_factory=dict)
-    errors: dict[str, SomaError] = field(default_factory=dict)
-    skipped: list[str] = field(default_factory=list)
-
-    def __len__(self) -> int:
-        return len(self.converted) + len(self.errors) + len(self.skipped)
-
-
-def convert_folder(
-    folder: str | Path, out: str | Path, *, options: ConvertOptions | None = None
-) -> FolderConverted:
-    """Convert every file in a folder; those that cannot be are left out and listed.
-
-    The folder is mirrored: ``motions`` and ``reports`` in `out` hold a file for each of its files, and
-    ``report.json`` lists them all. The same call goes on where an earlier one was stopped; what is there
-    already is not done again.
-
-    Args:
-        folder: motion files at any depth.
-        out: folder of the results; it may lie in `folder`.
-        options: of the conversions.
-
-    Raises:
-        InputError: no file may hold a motion.
-    """
-    folder, out = expanded(folder), Path(out)
-    if not folder.is_dir():
-        raise InputError(
-            str(folder), got="no folder", expected="one that holds motion files",
-            fix="Correct the path; one file is what convert_file takes.",
-        )  # fmt: skip
-    files = [file for file in _files(folder) if not file.is_relative_to(out.resolve())]
-    if not files:
-        raise InputError(
-            str(folder),
-            got=f"no file ending in {' or '.join(motion_suffixes())}",
-            expected="motion files, at any depth",
-            fix="Name the folder that holds them.",
-        )
-    convert = _converter(options or ConvertOptions(), refuse_unused=False)
-    found, rows = FolderConverted(), {}
-    everyone = options is not None and options.person == EVERYONE
-    try:
-        for number, file in enumerate(files, start=1):
-            name = file.relative_to(folder.resolve()).as_posix()
-            for one, converter in _converters(convert, file, name, everyone=everyone):
-                rows[one], told = _row(converter, file, out, one, found)
-                level = logging.WARNING if one in found.errors else logging.INFO
-                _log.log(level, "%d of %d: %s: %s", number, len(files), one, told)
-    finally:
-        document = {"input": str(folder.resolve()), "files": rows}
-        atomic_text(out / "report.json", json.dumps(document, indent=2) + "\n")
-    shutil.rmtree(out / "chunks", ignore_errors=True)
-    return found
-
-
-def _converters(
-    convert: Converter | BackConverter, file: Path, name: str, *, everyone: bool
-) -> list[tuple[str, Converter | BackConverter]]:
-    """What to convert of a file of a folder: the file, or each of its people where all are asked for."""
-    try:
-        people = _people(file) if everyone and isinstance(convert, Converter) else {}
-    except SomaError:
-        people = {}  # said when the file is converted
-    if not people or not isinstance(convert, Converter):
-        return [(name, convert)]
-    if len(people) == 1:
-        return [(name, convert.of_person(""))]
-    return [(f"{name}/{called}", convert.of_person(person)) for person, called in people.items()]
-
-
-def _converter(options: ConvertOptions, *, refuse_unused: bool = True) -> Converter | BackConverter:
+def converter_for(options: ConvertOptions, *, refuse_unused: bool = True) -> Converter | BackConverter:
+    """What converts in the direction of the options."""
     return Converter(options, refuse_unused=refuse_unused) if options.to == "soma" else BackConverter(options)
-
-
-def _files(folder: Path) -> Iterator[Path]:
-    """Files that may hold a motion, and folders of JSON frames, hidden ones apart, by their names."""
-    suffixes = motion_suffixes()
-    for file in sorted(folder.resolve().rglob("*")):
-        hidden = any(part.startswith(".") for part in file.relative_to(folder.resolve()).parts)
-        known = file.suffix.lower() in suffixes and file.is_file()
-        if not hidden and (known or holds_pose_frames(file)):
-            yield file
-
-
-def _unforeseen(file: Path, error: Exception) -> SomaError:
-    """What was not foreseen, as a sentence that names the file and the module where it happened."""
-    _log.debug("%s", file, exc_info=error)
-    module = next(
-        (
-            name
-            for frame, _ in reversed([*traceback.walk_tb(error.__traceback__)])
-            if (name := str(frame.f_globals.get("__name__"))).startswith("soma_core.")
-        ),
-        __name__,
-    )
-    told = " ".join(str(error).split())[:200] or "no text"
-    return SomaError(
-        f"{file}: {module} failed in a way that was not foreseen ({type(error).__name__}: {told}). "
-        "Leave the file out, and report it with the file."
-    )
-
-
-def _row(
-    convert: Converter | BackConverter, file: Path, out: Path, name: str, found: FolderConverted
-) -> tuple[Mapping[str, Any], str]:
-    """Convert one file of a folder; what becomes of it as a row of the report, and in words."""
-    try:
-        if layout_of(file) is None:
-            reason, poses = no_motion(file)
-            if poses:
-                raise reason
-            found.skipped.append(name)
-            told = f"holds no motion: {reason.got}"
-            return {"state": "skipped", "reason": told}, told
-        converted = convert(file, ResultFiles.mirrored(out, name), out / "chunks" / name)
-    except Exception as error:  # one file never ends a batch
-        refusal = error if isinstance(error, SomaError) else _unforeseen(file, error)
-        found.errors[name] = refusal
-        return {"state": "failed", "reason": str(refusal)}, str(refusal)
-    found.converted[name] = converted
-    report = converted.report
-    row = {"state": "converted", "layout": report["settings"]["layout"], "frames": report["frames"],
-           "fps": report["settings"]["fps"], "error_mm": converted.error_mm}  # fmt: skip
-    row |= {key: report[key] for key in ("warnings", "foot_slopes_degrees") if report.get(key)}
-    return row, str(converted)

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, cast
+from dataclasses import dataclass, field, fields
+from typing import TYPE_CHECKING, Any, cast
 
 from soma_core.choices import (
     AngleUnit,
@@ -15,6 +15,8 @@ from soma_core.choices import (
     Contacts,
     ConvertResult,
     Coordinates,
+    DatasetOutput,
+    Engine,
     FitLod,
     Gaps,
     Ground,
@@ -40,7 +42,10 @@ from soma_core.topology.frames import METRES
 if TYPE_CHECKING:
     from soma_core.plugin.spec import Unit
 
-__all__ = ["CleanOptions", "ConvertOptions", "FitOptions", "InvertOptions", "LimbSeconds", "SourceOptions"]
+__all__ = [
+    "CleanOptions", "ConvertOptions", "DatasetOptions", "FitOptions", "InvertOptions", "LimbSeconds",
+    "SourceOptions",
+]  # fmt: skip
 
 
 SIGNED: dict[str, UpAxis] = {"y": "+y", "z": "+z", "-y": "-y", "-z": "-z"}
@@ -262,6 +267,56 @@ class ConvertOptions(WriteOptions, FitOptions):
             )  # fmt: skip
         for name, value in self.given().items():
             raise InputError(name, got=value, expected=f"none with to={self.to}", fix=f"Leave {name} out.")
+
+
+@dataclass(kw_only=True)
+class DatasetOptions(ConvertOptions):
+    """A conversion of many files: who does it, and how the motions are kept.
+
+    Attributes:
+        engine: processes of this machine, or Ray.
+        output: a file for each, which mirror the folder, or Parquet shards with a row a clip.
+        workers: how many work at once; None: one a core, one on a GPU, and of a cluster as many as it takes.
+        num_gpus: GPUs of each of Ray's actors; parts of one are shared.
+        address: of a Ray cluster; None: Ray is started on this machine.
+        shard: clips in a shard.
+    """
+
+    engine: Engine = Engine.local
+    output: DatasetOutput = DatasetOutput.folder
+    workers: int | None = None
+    num_gpus: float = 0.0
+    address: str | None = None
+    shard: int = 64
+
+    def __post_init__(self) -> None:
+        """Refuse settings of the other engine, and what shards do not hold."""
+        super().__post_init__()
+        for name, least in (("shard", 1), ("workers", 1), ("num_gpus", 0)):
+            value = getattr(self, name)
+            if value is not None and value < least:
+                raise InputError(name, got=value, expected=f"at least {least}", fix=f"Leave {name} out.")
+        parquet, ray = self.output == "parquet", self.engine == "ray"
+        unused = {
+            "address": (None if ray else self.address, "engine=local", "Pass engine=ray."),
+            "num_gpus": (None if ray else self.num_gpus or None, "engine=local", "Pass engine=ray."),
+            "to": (self.to if parquet and self.to != "soma" else None, "output=parquet", "Leave output out."),
+            "write": (
+                ",".join(self.shown) if parquet and self.shown else None, "output=parquet", "Leave one out.",
+            ),
+        }  # fmt: skip
+        if self.num_gpus and self.device == "cpu":
+            unused["num_gpus"] = (self.num_gpus, "device=cpu", "Pass device=cuda.")
+        for name, (value, beside, fix) in unused.items():
+            if value is not None:
+                raise InputError(name, got=value, expected=f"none with {beside}", fix=fix)
+
+    @classmethod
+    def of(cls, options: ConvertOptions | None, **changes: Any) -> DatasetOptions:
+        """These options alone, of a conversion or of what a command adds to them."""
+        given = options or ConvertOptions()
+        known = {each.name: getattr(given, each.name) for each in fields(cls) if hasattr(given, each.name)}
+        return cls(**known | changes)
 
 
 @dataclass(kw_only=True)

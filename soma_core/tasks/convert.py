@@ -9,15 +9,9 @@ from typing import TYPE_CHECKING
 from omegaconf import OmegaConf
 
 from soma_core.errors import AssetError, InputError, SomaError
-from soma_core.io.point_files import is_one
-from soma_core.motion.conversion import (
-    EVERYONE,
-    FolderConverted,
-    convert_file,
-    convert_folder,
-    convert_people,
-)
-from soma_core.motion.files import layout_of
+from soma_core.motion.conversion import EVERYONE, convert_file, convert_people
+from soma_core.motion.folder import FolderConverted, convert_folder, is_one_motion
+from soma_core.motion.shards import ShardsConverted, convert_shards
 from soma_core.paths import expanded
 
 if TYPE_CHECKING:
@@ -45,8 +39,15 @@ def run(config: DictConfig, output: Path) -> None:
     if not path.exists():
         raise AssetError(path, cause="file is missing", fix="Check the path.")
     try:
-        if path.is_dir() and not _is_one(path, options):
+        if options.output == "parquet":
+            _say_shards(path, convert_shards(path, output, options=options), output / "report.json")
+        elif path.is_dir() and not is_one_motion(path, options):
             _say(path, convert_folder(path, output, options=options), output / "report.json")
+        elif options.engine == "ray":
+            raise InputError(
+                "engine", got="ray, for one file", expected="local, which one file is for",
+                fix="Leave engine out; or pass output=parquet for a Parquet file of clips.",
+            )  # fmt: skip
         elif options.person == EVERYONE:
             for person, converted in convert_people(path, output, options=options).items():
                 _log.info("%s, person %s: %s", path.name, person or "without a name", converted)
@@ -57,13 +58,6 @@ def run(config: DictConfig, output: Path) -> None:
     except KeyboardInterrupt:
         _log.warning("stopped; the same command with out=%s goes on from here", output)
         raise
-
-
-def _is_one(folder: Path, options: ConvertConfig) -> bool:
-    """Whether a folder is one motion, with a file a frame or a view."""
-    if options.points:
-        return is_one(folder, views=options.camera is not None)
-    return layout_of(folder) is not None
 
 
 def _say(folder: Path, found: FolderConverted, report: Path) -> None:
@@ -89,3 +83,18 @@ def _say(folder: Path, found: FolderConverted, report: Path) -> None:
     if errors:
         failed = f"{len(errors)} of {len(found)} files"
         raise SomaError(f"{failed} could not be converted, {report} lists them. The first: {errors[0]}")
+
+
+def _say_shards(source: Path, found: ShardsConverted, report: Path) -> None:
+    """Say what became of a data set.
+
+    Raises:
+        SomaError: a clip could not be converted.
+    """
+    told = ", ".join(f"{count} {state}" for state, count in sorted(found.counts.items()))
+    earlier = f", {found.earlier} of them by an earlier run" if found.earlier else ""
+    _log.info("%s: %s; %d shards in %s%s", source, told, len(found.shards), found.shards[0].parent, earlier)
+    if found.failed:
+        first = next(iter(found.failed.values()))
+        failed = f"{len(found.failed)} of {sum(found.counts.values())} clips"
+        raise SomaError(f"{failed} could not be converted, {report} lists them. The first: {first}")

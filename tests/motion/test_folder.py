@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from soma_core.errors import AssetError, InputError
-from soma_core.motion import ConvertOptions, conversion, convert, convert_folder, identities
+from soma_core.motion import ConvertOptions, conversion, convert, convert_folder, folder, identities
 from soma_core.paths import assets_dir
 from tests.motion.test_converter import motion, write_motion
 
@@ -105,14 +105,14 @@ def test_twist_and_correctives_are_options_of_a_conversion(smplh_models, amass_f
 def test_what_nobody_foresaw_is_one_failed_row(tmp_path, monkeypatch, kind):
     for name in "ab":
         write_motion(motion(), tmp_path / f"{name}.npz")
-    read = conversion.layout_of
+    read = folder.layout_of
 
     def failing(file):
         if file.name == "a.npz":
             raise kind("deep in a reader")
         return read(file)
 
-    monkeypatch.setattr(conversion, "layout_of", failing)
+    monkeypatch.setattr(folder, "layout_of", failing)
     found = convert_folder(tmp_path, tmp_path / "out")
     assert list(found.converted) == ["b.npz"]
     told = str(found.errors["a.npz"])
