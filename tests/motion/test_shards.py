@@ -183,8 +183,9 @@ def test_a_full_disk_ends_the_run_and_keeps_what_is_finished(data, tmp_path, her
 
 
 def test_a_full_disk_below_a_clip_is_no_broken_clip(data, tmp_path, here, monkeypatch):
-    def full(*_):
-        raise OSError(errno.ENOSPC, "No space left on device")
+    def full(path):
+        if path.is_file():
+            raise OSError(errno.ENOSPC, "No space left on device")
 
     monkeypatch.setattr(folder, "layout_of", full)
     with pytest.raises(UnwritableError):
