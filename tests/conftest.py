@@ -14,11 +14,22 @@ _SWITCHES = ("SOMA_BACKENDS", "SOMA_STRICT", "SOMA_ASSETS")
 
 
 @pytest.fixture(autouse=True)
-def _plain_environment(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A developer's own SOMA_* switches do not change what the tests see; the cache stays shared."""
+def _plain_environment(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """A developer's own SOMA_* switches do not change what the tests see; the cache stays shared.
+
+    Nor does a test change the number of threads of those after it, which then wait for each other.
+    """
     for name in _SWITCHES:
         if name in os.environ:
             monkeypatch.delenv(name)
+    before = _threads()
+    yield
+    assert before in (None, _threads()), f"left torch with {_threads()} threads, which had {before}"
+
+
+def _threads() -> int | None:
+    """Threads of torch, or None before something has imported it."""
+    return sys.modules["torch"].get_num_threads() if "torch" in sys.modules else None
 
 
 @pytest.fixture(params=[True, pytest.param(False, marks=pytest.mark.slow)], ids=["fast", "full"])

@@ -6,7 +6,8 @@ import json
 import logging
 import statistics
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -35,7 +36,22 @@ def run(config: DictConfig, output: Path) -> None:
     Raises:
         SomaError: the timed path and the reference disagree; nothing is timed then.
     """
-    torch.set_num_threads(config.threads)
+    with _threads(config.threads):
+        _run(config, output)
+
+
+@contextmanager
+def _threads(count: int) -> Iterator[None]:
+    """Let torch take `count` threads; a caller from Python has its own number back afterwards."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(count)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
+
+
+def _run(config: DictConfig, output: Path) -> None:
     backend: BackendChoice = OmegaConf.to_object(config.backend)
     begin = time.perf_counter()
     layer = SomaLayer(

@@ -68,7 +68,7 @@ def mark(anny_pair) -> int:
     return int(np.argsort(away)[1])
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="module", params=[pytest.param(None, marks=pytest.mark.slow, id="whole")])
 def anny(anny_pair, hole: np.ndarray, mark: int) -> Registration:
     """With a hole and a landmark, which change nothing elsewhere."""
     return register(*anny_pair[0], options=WrapOptions(masked=hole.tolist(), landmarks={midline(1): mark}))
