@@ -8,6 +8,7 @@ import re
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 
@@ -52,6 +53,9 @@ _RATES = (
     30 / 1.001,
     60 / 1.001,
 )
+_LEAST = 0.2
+"""Largest angle [degrees] of a clip that moves; angles of radians end at a turn."""
+
 _FIX = "Export it again as BVH, with HIERARCHY and MOTION."
 
 
@@ -66,7 +70,13 @@ class _Tree:
     channels: list[list[tuple[int, bool]]] = field(default_factory=list)
 
 
-def read_bvh(path: str | Path, *, fps: float | None = None, root: str | None = None) -> SkeletonMotion:
+def read_bvh(
+    path: str | Path,
+    *,
+    fps: float | None = None,
+    root: str | None = None,
+    angles: Literal["rad", "deg"] | None = None,
+) -> SkeletonMotion:
     """Read a BVH file; lengths stay in its unit and axes, which it does not tell.
 
     Position channels replace the offset of their joint, unless they are all zero. Damage that leaves whole
@@ -76,6 +86,7 @@ def read_bvh(path: str | Path, *, fps: float | None = None, root: str | None = N
         path: the file.
         fps: frame rate; overrides the frame time.
         root: name of the root joint, where the file has several.
+        angles: unit of rotation channels; None for degrees.
 
     Raises:
         AssetError: missing, damaged or no BVH.
@@ -104,6 +115,11 @@ def read_bvh(path: str | Path, *, fps: float | None = None, root: str | None = N
             cut,
         )
     rows = values[: frames * width].reshape(frames, width)
+    turning = np.array([rotates for channels in tree.channels for _, rotates in channels])
+    if angles == "rad":
+        rows = np.where(turning, np.degrees(rows), rows)
+    elif frames > 1 and _LEAST < np.abs(rows[:, turning]).max(initial=0) <= 2 * np.pi:
+        _log.warning("%s: no angle is above 6.28; if they are radians, pass angles=rad", path.name)
     return _motion(path, tree, rows, rate, root)
 
 

@@ -33,6 +33,9 @@ _OTHERS = {22: "SMPL-X", 27: "the older core skeleton", 34: "the Unitree G1 robo
 _MEASURED = 64
 """Frames, spread over the motion, that the skeleton is measured in: bones are rigid."""
 
+_RIGID = 0.02
+"""Largest median change of a bone over these frames, in its length."""
+
 _THUMB = {"1": 1 / 3, "2": 1 / 3, "3": 1 / 3}
 _FINGER = {"2": 3 / 8, "3": 3 / 8, "4": 2 / 8}
 """Shares of the turn from hand to finger end. The palm (joint 1 of a finger) is stiff, and the last joint of
@@ -180,6 +183,7 @@ def _skeleton(sample: _Sample, local: np.ndarray, names: tuple[str, ...], metres
     joints = _extra(sample, "posed_joints", (len(local), len(names), 3))
     if joints is None:
         return None
+    loose = 0
     few = np.unique(np.linspace(0, len(local) - 1, _MEASURED).astype(int))
     joints, world = joints[few], local[few]
     offsets = np.full((len(USER_JOINTS), 3), np.nan)
@@ -191,5 +195,15 @@ def _skeleton(sample: _Sample, local: np.ndarray, names: tuple[str, ...], metres
         if PARENT_NAMES[names[index]] == names[ancestor]:
             bone = (turned @ (joints[:, index] - joints[:, ancestor])[..., None])[..., 0]
             offsets[USER_JOINTS.index(names[index])] = metres * np.median(bone, axis=0)
+            middle = np.median(bone, axis=0)
+            change = np.median(np.linalg.norm(bone - middle, axis=1))
+            loose += change > _RIGID * np.linalg.norm(middle)
         world[:, index] = world[:, ancestor] @ world[:, index]
+    if loose > len(names) // 10:
+        _log.warning(
+            "%s: posed_joints do not fit the rotations: %d bones change length or direction, as with axes "
+            "of another hand, or another upward axis; write both with +y up",
+            sample.fields.path.name, loose,
+        )  # fmt: skip
+        return None
     return offsets

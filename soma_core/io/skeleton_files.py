@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
+from typing import Literal
 
 from soma_core.errors import InputError
 from soma_core.files import refuse_unreadable
@@ -24,13 +25,20 @@ SKELETON_SUFFIXES = tuple(_READERS)
 """Files that hold a skeleton in motion."""
 
 
-def read_skeleton(path: str | Path, *, fps: float | None = None, root: str | None = None) -> SkeletonMotion:
+def read_skeleton(
+    path: str | Path,
+    *,
+    fps: float | None = None,
+    root: str | None = None,
+    angles: Literal["rad", "deg"] | None = None,
+) -> SkeletonMotion:
     """Read the joints of a file over time; lengths and axes are as the file has them.
 
     Args:
         path: ``.bvh``, ``.fbx``, ``.glb``, ``.vrm`` or ``.usd``. Nothing in it is executed.
         fps: frame rate; overrides that of a BVH, and is what the others are sampled at.
         root: name of the skeleton or its root joint, where a file has several.
+        angles: unit of a BVH's rotation channels; None for degrees. The others tell theirs.
 
     Raises:
         AssetError: missing, damaged, or without a skeleton.
@@ -42,4 +50,9 @@ def read_skeleton(path: str | Path, *, fps: float | None = None, root: str | Non
     if reader is None:
         raise InputError(str(path), got=f"the suffix {path.suffix!r}", expected=", ".join(_READERS),
                          fix="Export the skeleton in one of these formats.")  # fmt: skip
+    if angles == "rad":
+        if reader is not read_bvh:
+            raise InputError("angles", got=f"rad for {path.name}", expected="none: the file tells its angles",
+                             fix="Leave angles out.")  # fmt: skip
+        return read_bvh(path, fps=fps, root=root, angles=angles)
     return reader(path, fps=fps, root=root)

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, replace
-from enum import StrEnum
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -13,9 +12,7 @@ import numpy as np
 
 from soma_core.errors import AssetError, InputError
 from soma_core.io.amass import SmplMotion
-from soma_core.io.rotation_vectors import in_radians
 from soma_core.io.sam3d import Sam3dFrames, read_sam3d
-from soma_core.io.smpl_files import SmplChoices, read_smpl
 from soma_core.io.vertex_files import open_vertex_sequence
 from soma_core.motion.files import read_model_motion
 from soma_core.motion.models import (
@@ -28,24 +25,16 @@ from soma_core.motion.models import (
 from soma_core.motion.options import ConvertOptions, FitOptions, InvertOptions
 from soma_core.motion.posed_input import PosedInput
 from soma_core.motion.questions import of_params, of_rate, of_smpl
+from soma_core.motion.smpl_input import chosen_reading, smpl_choices, smpl_motion
 from soma_core.plugin.errors import BackendError, BrokenBackendError
 from soma_core.plugin.registry import default_registry
 
 if TYPE_CHECKING:
     from soma_core.plugin.spec import BackendSpec
 
-__all__ = ["FITTED", "SMPL_LAYOUTS", "SMPL_SETTINGS", "ShownBody", "is_fitted", "open_body"]
+__all__ = ["FITTED", "ShownBody", "is_fitted", "open_body"]
 
 _log = logging.getLogger(__name__)
-
-SMPL_LAYOUTS = ("amass", "smpl")
-"""Layouts whose bodies are of the SMPL family."""
-
-SMPL_SETTINGS = (
-    "gender", "betas", "betas_from", "model", "person", "coordinates", "rotation_layout", "flat_hand_mean",
-    "gaps", "longest_gap",
-)  # fmt: skip
-"""Options that choose how their files are read."""
 
 _MHR, _DEFAULT = "mhr", "soma"
 _BONE_LENGTHS, _SCALES = slice(130, 136), slice(136, 204)
@@ -162,12 +151,7 @@ def _smpl_body(path: Path, options: ConvertOptions, backends: FitBackends) -> Sh
     Raises:
         SomaError: the file cannot be read, or the user's model of that gender is not there.
     """
-    motion = read_smpl(path, smpl_choices(options))
-    motion = replace(
-        motion,
-        rotations=in_radians(path, motion.rotations, options.angles),
-        translation=motion.translation * (options.metres or 1.0),
-    )
+    motion = smpl_motion(path, options, smpl_choices(options))
     backend = _with_way_out(
         backends, motion.model, {"gender": motion.gender}, "carry=skeleton, which needs no model"
     )
@@ -179,31 +163,10 @@ def _smpl_body(path: Path, options: ConvertOptions, backends: FitBackends) -> Sh
         posed=PosedInput(sequence, backend.layer, topology="native"),
         params=params,
         search={},
-        facts={"up": motion.up, **_reading(options), **_units(options)},
+        facts={"up": motion.up, **chosen_reading(options), **_units(options)},
         licence=f"that of {path.name}; body model: {backend.layer.spec.licence}",
         doubts=tuple(of_smpl(motion) + of_params(backend.layer.spec, params, setting="")),
     )
-
-
-def smpl_choices(options: ConvertOptions) -> SmplChoices:
-    """How a file of the SMPL family is read; ``person=all`` of a file of one is that one."""
-    given = {
-        name: str(value) if isinstance(value, StrEnum) else value
-        for name in SMPL_SETTINGS
-        if (value := getattr(options, name)) is not None
-    }
-    if given.get("person") == "all":
-        del given["person"]
-    return SmplChoices(**given, up=options.upward, fps=options.fps)
-
-
-def _reading(options: ConvertOptions) -> dict[str, Any]:
-    """Settings of the reading that are not those of every file, for the report."""
-    plain = SmplChoices()
-    read = vars(smpl_choices(options))
-    return {
-        name: read[name] for name in SMPL_SETTINGS if name != "gender" and read[name] != getattr(plain, name)
-    }
 
 
 def _model_pose(

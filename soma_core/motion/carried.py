@@ -14,12 +14,12 @@ from soma_core.io.joint_names import read_mapping
 from soma_core.io.motion import Motion
 from soma_core.io.skeleton_files import read_skeleton
 from soma_core.io.skeleton_motion import soma_skeleton
-from soma_core.io.smpl_files import read_smpl
 from soma_core.io.smpl_skeleton import smpl_skeleton
-from soma_core.motion.bodies import SMPL_LAYOUTS, smpl_choices
 from soma_core.motion.foot_lock import Limb
 from soma_core.motion.options import ConvertOptions
+from soma_core.motion.questions import of_path, of_rate, of_smpl, say
 from soma_core.motion.retarget import Retargeted, retarget
+from soma_core.motion.smpl_input import SMPL_LAYOUTS, smpl_choices, smpl_motion
 from soma_core.rig import load_canonical
 from soma_core.rig.skeleton import Rig
 
@@ -39,21 +39,26 @@ def carried(path: Path, layout: str, options: ConvertOptions) -> Retargeted:
     """
     up, match = options.upward, options.match
     if layout in SMPL_LAYOUTS:
-        motion = read_smpl(path, replace(smpl_choices(options), gender="neutral", betas=(0.0,) * 10))
+        choices = replace(smpl_choices(options), gender="neutral", betas=(0.0,) * 10)
+        motion = smpl_motion(path, options, choices)
+        say(path.name, of_smpl(motion))
         _log.warning("%s: betas are not read: joints are carried over, no body is fitted", path.name)
         if motion.hand_components is not None and motion.hand_components.size:
             _log.warning("%s: hands are components of the model: the fingers stay straight", path.name)
         source, up, match = smpl_skeleton(motion, load_canonical("mid")[1]), None, match or BoneMatch.limbs
     else:
-        source = read_skeleton(path, fps=options.fps, root=options.root)
+        source = read_skeleton(path, fps=options.fps, root=options.root, angles=options.angles)
     mapping = read_mapping(options.mapping) if options.mapping else None
     found = retarget(
         source,
         mapping=mapping,
-        unit=str(options.unit) if options.unit else None,
+        unit=str(options.unit) if options.unit and layout not in SMPL_LAYOUTS else None,
         up=up,
         match=str(match or BoneMatch.soles),
     )
+    if layout not in SMPL_LAYOUTS:
+        moved = found.motion
+        say(path.name, of_rate(moved.fps) + of_path(moved.translation, moved.fps, up="+y", what="its path"))
     found = refined(found) if options.refine == "joints" else found
     left = found.report["not_carried"]
     if left:

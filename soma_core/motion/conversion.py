@@ -14,12 +14,12 @@ from soma_core.io.motion import Motion
 from soma_core.io.motion_files import samples_of
 from soma_core.io.smpl_files import people_of
 from soma_core.motion.back import BackConverter
-from soma_core.motion.bodies import SMPL_LAYOUTS
 from soma_core.motion.converter import Converted, Converter
 from soma_core.motion.files import ResultFiles, layout_of, read
 from soma_core.motion.options import ConvertOptions
 from soma_core.motion.poses import POSES, named_pose
 from soma_core.motion.questions import Names, of_motion, say
+from soma_core.motion.smpl_input import SMPL_LAYOUTS
 from soma_core.options import FrameRange, ModelOptions, Picture
 from soma_core.paths import expanded
 from soma_core.rig.manifest import shipped_file

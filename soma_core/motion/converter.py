@@ -14,7 +14,7 @@ from soma_core.errors import AssetError, InputError, SomaError
 from soma_core.io.motion import Motion
 from soma_core.io.motion_files import read_motion
 from soma_core.json_file import read_json
-from soma_core.motion.bodies import SMPL_LAYOUTS, is_fitted, open_body
+from soma_core.motion.bodies import is_fitted, open_body
 from soma_core.motion.carried import carried
 from soma_core.motion.chunks import refuse_other_settings
 from soma_core.motion.files import Layout, ResultFiles, layout_of, no_motion, read, write
@@ -24,6 +24,7 @@ from soma_core.motion.options import ConvertOptions, FitOptions, InvertOptions
 from soma_core.motion.pointed import from_points
 from soma_core.motion.products import BodyProducts
 from soma_core.motion.questions import heard, of_motion, say, unused_settings
+from soma_core.motion.smpl_input import SMPL_LAYOUTS
 from soma_core.paths import expanded
 
 __all__ = ["Converted", "Converter", "earlier_report", "finish_fit", "invert", "plan_fit"]

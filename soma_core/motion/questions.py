@@ -64,6 +64,9 @@ _AT_ONCE, _FEW = 0.6, 5
 """Share of that way in one step that makes it a leap, as from one recording to the next, and the frames of a
 clip in which that can be told."""
 
+_STEP, _FASTEST = 3.0, 40.0
+"""A step from one frame to the next that is a leap, however slow the rest is [m], and its speed [m/s]."""
+
 _STILL = 0.002
 """Speed [m/s] below which hips do not stay, of a person who stands; 0 is that of a single pose."""
 
@@ -221,6 +224,9 @@ def _fastest(places: np.ndarray, fps: float) -> tuple[float, int | None]:
     ways = {lag: np.linalg.norm(places[lag:] - places[:-lag], axis=1) for lag in lags}
     lag = max(lags, key=lambda each: float(ways[each].max()))
     far, leap = float(ways[lag].max()), int(ways[1].argmax()) + 1
+    step = float(ways[1].max())
+    if far <= _LEAP and step > _STEP and step * fps > _FASTEST and len(places) >= _FEW:
+        return step * fps, leap
     if far <= _LEAP:
         return 0.0, None
     at_once = len(places) >= _FEW and ways[1][leap - 1] > _AT_ONCE * far
@@ -283,7 +289,7 @@ _APPLY: dict[str, frozenset[str]] = dict.fromkeys(
      "flat_hand_mean", "gaps", "longest_gap", "carry"), _SMPL,
 ) | {
     "person": _SMPL | _KEPT,
-    "angles": _SMPL | {"soma"},
+    "angles": _SMPL | {"soma", "skeleton"},
     "convention": frozenset({"soma"}),
     "up": _SMPL | {"sam3d", "skeleton"},
     "axes": _SMPL | {"sam3d", "skeleton"},

@@ -127,10 +127,30 @@ def placed(source: SkeletonMotion, match: Mapping[str, int], *, unit: str | None
         up = ("+" if rising[axis] > 0 else "-") + "xyz"[axis]
     up = up if up[0] in "+-" else f"+{up}"
     turn = _AXES[up]
+    if standing:
+        _warn_mirrored(source, match)
     _warn_lying(source, turn @ unit_vector(_mean_trunk(source, match)), turn)
     return Placed(
         source=source.placed(turn, metres, "+y"), metres=metres, up=up, turn=turn, standing=standing
     )
+
+
+def _warn_mirrored(source: SkeletonMotion, match: Mapping[str, int]) -> None:
+    """Say so where toes at rest point backwards, as left and right have it."""
+    rest, found = source.rest, 0.0
+    _, trunk = legs_and_trunk(source, match)
+    if {"LeftLeg", "RightLeg"} <= set(match):
+        left = rest[match["LeftLeg"]] - rest[match["RightLeg"]]
+        for foot, toe in (("LeftFoot", "LeftToeBase"), ("RightFoot", "RightToeBase")):
+            if foot in match and toe in match:
+                ahead = unit_vector(np.cross(left, trunk))
+                found += float(ahead @ unit_vector(rest[match[toe]] - rest[match[foot]]))
+    if found < -_STANDING:
+        _log.warning(
+            "%s: its toes point backwards, if left is left: the names of the sides are exchanged, and "
+            "mapping=FILE tells which joint is which, or it has axes of a left hand",
+            source.source,
+        )  # fmt: skip
 
 
 def legs_and_trunk(source: SkeletonMotion, match: Mapping[str, int]) -> tuple[np.ndarray, np.ndarray]:

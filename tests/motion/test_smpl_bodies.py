@@ -11,7 +11,8 @@ from scipy.spatial.transform import Rotation
 from soma_core import SmplMotion
 from soma_core.errors import InputError
 from soma_core.motion import ConvertOptions, conversion, convert_people
-from soma_core.motion.bodies import _model_pose, smpl_choices
+from soma_core.motion.bodies import _model_pose
+from soma_core.motion.smpl_input import smpl_choices
 from tests.io.smpl_layouts import save_pickle, wham
 
 FRAMES = 3
