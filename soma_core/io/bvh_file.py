@@ -53,8 +53,8 @@ _RATES = (
     30 / 1.001,
     60 / 1.001,
 )
-_LEAST = 0.2
-"""Largest angle [degrees] of a clip that moves; angles of radians end at a turn."""
+_LEAST, _CLIP = 0.2, 10
+"""Largest angle [degrees] of a clip that moves, which has so many frames; radians end at a turn."""
 
 _FIX = "Export it again as BVH, with HIERARCHY and MOTION."
 
@@ -118,7 +118,7 @@ def read_bvh(
     turning = np.array([rotates for channels in tree.channels for _, rotates in channels])
     if angles == "rad":
         rows = np.where(turning, np.degrees(rows), rows)
-    elif frames > 1 and _LEAST < np.abs(rows[:, turning]).max(initial=0) <= 2 * np.pi:
+    elif frames >= _CLIP and _LEAST < np.abs(rows[:, turning]).max(initial=0) <= 2 * np.pi:
         _log.warning("%s: no angle is above 6.28; if they are radians, pass angles=rad", path.name)
     return _motion(path, tree, rows, rate, root)
 

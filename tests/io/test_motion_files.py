@@ -382,6 +382,16 @@ def test_kimodo_keeps_contacts_and_the_skeleton_that_moved(tmp_path):
     assert read_motion(posed(tmp_path / "k.npz", foot_contacts=None)[0]).contacts is None
 
 
+def test_kimodo_joints_in_other_axes_than_the_rotations_are_said(tmp_path, caplog):
+    path, _ = posed(tmp_path / "k.npz")
+    joints = np.load(path)["posed_joints"]
+    for changed in (joints * [-1, 1, 1], joints[..., [0, 2, 1]] * [1, -1, 1]):
+        caplog.clear()
+        motion = read_motion(posed(tmp_path / "k.npz", posed_joints=changed)[0])
+        assert "do not fit the rotations" in caplog.text
+        assert motion.skeleton is None
+
+
 def test_kimodo_extras_that_are_not_as_they_should_be_are_said_and_left_out(tmp_path, caplog):
     hips = np.zeros((6, 3))
     path, _ = posed(

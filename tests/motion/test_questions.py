@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import logging
 import os
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,10 +15,16 @@ from scipy.spatial.transform import Rotation
 from soma_core import SmplMotion
 from soma_core.errors import InputError
 from soma_core.io import USER_JOINTS, Motion, write_motion
+from soma_core.io.bvh import write_bvh
 from soma_core.io.rotation_vectors import in_radians
+from soma_core.io.skeleton_files import read_skeleton
 from soma_core.motion import ConvertOptions, convert_file, convert_folder, load_clip, questions, read
 from soma_core.motion.posed_input import world_axes
+from soma_core.motion.retarget import retarget
 from soma_core.plugin.registry import default_registry
+from tests.motion.test_retarget import MIXAMO
+from tests.skeletons import biped
+from tests.skeletons import moved as moved_biped
 
 FPS, FRAMES = 30, 240
 SECONDS = np.arange(FRAMES) / FPS
@@ -152,6 +159,82 @@ def test_degrees_are_told_from_radians(tmp_path, model, largest):
     np.testing.assert_allclose(in_radians(tmp_path, degrees, "deg"), vectors)
     with pytest.raises(InputError, match=r"angles: got deg for .* largest angle .*Leave angles out"):
         in_radians(tmp_path, vectors, "deg")
+
+
+def test_joints_carried_over_are_questioned_too(tmp_path, caplog):
+    """Without the model, SMPL's angles and lengths are asked for as with it, and the settings mend them."""
+    poses = np.zeros((FRAMES, 22, 3))
+    poses[:, 0] = Rotation.from_euler("x", 90, degrees=True).as_rotvec()
+    poses[:, 4] = np.linspace([0, 0, 0], [1.2, 0, 0], FRAMES)
+    names = {
+        "betas": np.zeros(10),
+        "gender": "neutral",
+        "mocap_frame_rate": 30.0,
+        "surface_model_type": "smplx",
+    }
+    walk = WALK[:, [0, 2, 1]]
+    np.savez(tmp_path / "a.npz", poses=poses.reshape(FRAMES, -1), trans=walk, **names)
+    wrong = np.degrees(poses.reshape(FRAMES, -1))
+    np.savez(tmp_path / "b.npz", poses=wrong, trans=100 * walk, **names)
+    options = ConvertOptions(carry="skeleton")
+    right = convert_file(tmp_path / "a.npz", tmp_path / "a", options=options)
+    assert not [text for text in right.report["warnings"] if "pass" in text]
+    found = convert_file(tmp_path / "b.npz", tmp_path / "b", options=options)
+    assert any("angles=deg" in text for text in found.report["warnings"])
+    options = ConvertOptions(carry="skeleton", angles="deg", unit="cm")
+    found = convert_file(tmp_path / "b.npz", tmp_path / "c", options=options).motion()
+    np.testing.assert_allclose(found.rotations, right.motion().rotations, atol=1e-5)
+    np.testing.assert_allclose(found.translation, right.motion().translation, atol=1e-5)
+
+
+def test_a_path_in_another_unit_than_the_bones_is_said(tmp_path, caplog):
+    source = upright()
+    write_bvh(replace(source, root=100 * source.root), tmp_path / "a.bvh")
+    said = convert_file(tmp_path / "a.bvh", tmp_path / "out").report["warnings"]
+    assert any("above the ground" in text for text in said), said
+
+
+def test_angles_of_a_bvh_may_be_radians(tmp_path, caplog):
+    source = upright()
+    write_bvh(source, tmp_path / "a.bvh")
+    expected = read_skeleton(tmp_path / "a.bvh")
+    assert "angles=rad" not in caplog.text
+    head, _, rows = (tmp_path / "a.bvh").read_text().partition("Frame Time:")
+    time, _, rows = rows.partition("\n")
+    numbers = np.array([row.split() for row in rows.splitlines()], np.float64)
+    numbers[:, 3:] = np.radians(numbers[:, 3:])
+    rows = "\n".join(" ".join(map(repr, map(float, row))) for row in numbers)
+    (tmp_path / "b.bvh").write_text(f"{head}Frame Time:{time}\n{rows}\n")
+    read_skeleton(tmp_path / "b.bvh")
+    assert "angles=rad" in caplog.text
+    found = convert_file(tmp_path / "b.bvh", tmp_path / "out", options=ConvertOptions(angles="rad"))
+    assert not any("angles" in text for text in found.report["warnings"])
+    np.testing.assert_allclose(
+        read_skeleton(tmp_path / "b.bvh", angles="rad").rotations, expected.rotations, atol=1e-6
+    )
+
+
+def upright():
+    """A walker of another skeleton."""
+    return moved_biped(*biped(MIXAMO), seed=4)
+
+
+@pytest.mark.parametrize("axis", [0, 2])
+def test_a_mirrored_skeleton_is_said(axis, tmp_path, caplog):
+    source = upright()
+    assert not retarget(source).report["not_carried"]
+    assert "backwards" not in caplog.text
+    signs = np.where(np.arange(3) == axis, -1, 1)
+    retarget(replace(source, rest=source.rest * signs))
+    assert "toes point backwards" in caplog.text
+    assert "mapping=FILE" in caplog.text
+
+
+def test_a_leap_within_a_step_is_named():
+    """Eight metres from one frame to the next are none's, though half a minute of walking is as far."""
+    path = WALK.copy()
+    path[100:, 0] += 8
+    assert "leaps at frame 100" in " ".join(questions.of_motion(moved(path)))
 
 
 def test_a_body_that_was_turned_many_times_is_no_file_of_degrees():
