@@ -154,7 +154,7 @@ class ConvertOptions(WriteOptions, FitOptions):
         result: of the way back; None: poses of SMPL models, vertices of others.
         gender: of SMPL models; None: that of the file.
         most_betas: how many of a file's shape coefficients are used; None: all.
-        angles: unit of a file's rotation vectors, or of the angles of a BVH; None: radians, and degrees of a BVH.
+        angles: unit of a file's rotation vectors, None: radians; or of the angles of a BVH, None: degrees.
         convention: zero of the rotations in a file on this skeleton; None: as the file says.
         betas: shape coefficients of SMPL models; None: those of the file, on the way back the body's own, or
             the nearest.
