@@ -17,14 +17,19 @@ from tests.bodies import randn
 LAYER = SomaLayer("soma", lod="low", dtype=torch.float64)
 
 
+@pytest.fixture(scope="module")
+def both() -> list[SomaLayer]:
+    return [SomaLayer("soma", lod=lod) for lod in ("low", "mid")]
+
+
 @pytest.mark.parametrize("name", sorted(find_point_sets(Registry(()))))
-def test_every_shipped_set_lies_on_both_meshes(name: str) -> None:
+def test_every_shipped_set_lies_on_both_meshes(name: str, both: list[SomaLayer]) -> None:
     points = load_point_set(name)
     assert points.name == name
     assert points.about
     assert points.source
-    for lod in ("low", "mid"):
-        places = SomaLayer("soma", lod=lod).places(points)
+    for layer in both:
+        places = layer.places(points)
         assert places.names == points.names
 
 
