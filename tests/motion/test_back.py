@@ -56,6 +56,7 @@ def test_an_amass_motion_comes_back(smplh_models, fitted, amass, tmp_path):
     assert converted(fitted, tmp_path, to="smplh", chunk=4).earlier
 
 
+@pytest.mark.slow
 def test_an_unknown_body_is_found_once(smplh_models, fitted, tmp_path, monkeypatch):
     """Somebody of another backend: betas are sought, and a stopped run does not seek them again."""
     searches, saves = [], []

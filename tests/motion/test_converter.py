@@ -116,6 +116,7 @@ def test_an_amass_motion_is_posed_by_its_own_model_and_fitted(smplh_models, amas
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == names
 
 
+@pytest.mark.slow
 def test_what_was_fitted_before_is_left_alone(smplh_models, amass, amass_file, tmp_path, monkeypatch):
     fits = []
     original = converter.FitJob.fit_missing

@@ -45,6 +45,7 @@ def body(**values):
     return {name: values.get(name, torch.zeros(1, size)) for name, size in sizes.items()}
 
 
+@pytest.mark.slow
 def test_poses_of_the_model_are_found_however_it_is_turned(tools):
     layer, fit = tools
     random = np.random.default_rng(0)
@@ -64,6 +65,7 @@ def test_poses_of_the_model_are_found_however_it_is_turned(tools):
     assert 1e3 * float(found.vertex_error[:2].nanmean()) < SAME_MM
 
 
+@pytest.mark.slow
 def test_a_body_is_found_from_its_t_pose(tools):
     layer, fit = tools
     identity = layer.identity({"identity": torch.tensor([[0.5, -0.5, 0.3] + [0.0] * 42])})
