@@ -24,6 +24,7 @@ from soma_core.motion.played import MovingBodies, Played, placing_of
 from soma_core.motion.writers import WRITERS, WriteOptions
 from soma_core.options import BvhChoice, Picture, VideoChoice
 from soma_core.skeleton.identity import Identity
+from soma_core.view.eyes import with_eyes
 from soma_core.view.picture import backend_colour, contact_sheet
 from soma_core.view.stage import Body
 from soma_core.view.video import write_video
@@ -218,13 +219,14 @@ def draw_video(path: Path, played: Played, choice: VideoChoice) -> None:
 
 def _drawn(played: Played, frame: int) -> Body:
     """The body in a frame, as pictures have it."""
-    layer = played.layer
-    return Body(
-        vertices=played.posed(slice(frame, frame + 1))[0].cpu().numpy(),
+    layer, frames = played.layer, slice(frame, frame + 1)
+    body = Body(
+        vertices=played.posed(frames)[0].cpu().numpy(),
         triangles=layer.mesh.triangles,
         colour=backend_colour(layer.backend),
         caption=f"{frame / played.motion.fps:.2f} s",
     )
+    return with_eyes(body, played.transforms(frames)[0].cpu().numpy(), layer.rig)
 
 
 def _rounded(value: Any) -> Any:

@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from soma_core.io.joint_order import PARENT_NAMES, USER_JOINTS
 from soma_core.view.error_picture import error_colours, scale_top
+from soma_core.view.eyes import EYES, eyeball, eyeball_places
 from soma_core.view.picture import backend_colour
 from soma_core.viewer.session import Figure, Session, Shape
 
@@ -22,12 +23,6 @@ _BONES = np.array([(USER_JOINTS.index(parent), USER_JOINTS.index(joint))
 _BONE, _JOINT = (38, 70, 140), (240, 190, 60)
 _GHOST = 0.45
 """Opacity of skin through which bones are seen."""
-
-_EYES = ("LeftEye", "RightEye")
-_BALL, _FRONT = 0.19, 0.15
-"""Radius of an eyeball, as a share of the distance of the eyes; how far before its joint it lies, of that."""
-
-_PUPIL, _IRIS, _WHITE = (24, 22, 22), (96, 74, 54), (236, 234, 230)
 
 _BANDS = 7
 """Colours of errors."""
@@ -164,16 +159,14 @@ class Scene:
         """Eyeballs, which the mesh has not: no vertex hangs on the joints of the eyes, which turn unseen."""
         if shape.joints is None or shape.turns is None:
             return
-        left, right = (USER_JOINTS.index(name) for name in _EYES)
-        radius = _BALL * float(np.linalg.norm(shape.joints[left] - shape.joints[right]))
-        before = _FRONT * radius * shape.turns[USER_JOINTS.index("Head"), :, 2]
-        for index in (left, right):
+        radius, centres = eyeball_places(shape.joints, shape.turns)
+        for index, centre in zip(EYES, centres, strict=True):
             path = self._path(figure, f"/eye{index}")
             make = functools.partial(self._server.scene.add_mesh_trimesh, path)
-            node = self._node(path, lambda make=make: make(_eyeball()))
+            node = self._node(path, lambda make=make: make(_coloured_ball()))
             node.visible = visible
             if visible:
-                node.scale, node.position = radius, shape.joints[index] + before
+                node.scale, node.position = radius, centre
                 node.wxyz = _wxyz(shape.turns[index])
 
     def _bones(self, figure: Figure, shape: Shape) -> None:
@@ -289,15 +282,12 @@ class Scene:
             node.position = place
 
 
-def _eyeball() -> Any:
-    """A ball of radius 1 that looks along +Z, with an iris."""
+def _coloured_ball() -> Any:
     import trimesh
 
-    ball = trimesh.creation.icosphere(subdivisions=4)
-    off = np.degrees(np.arccos(np.clip(ball.vertices[:, 2], -1, 1)))
-    shades = np.select([off[:, None] < 12, off[:, None] < 27], [_PUPIL, _IRIS], _WHITE)
-    ball.visual.vertex_colors = np.column_stack([shades, np.full(len(shades), 255)]).astype(np.uint8)
-    return ball
+    vertices, faces, shades = eyeball()
+    colours = np.column_stack([shades, np.full(len(shades), 255, np.uint8)])
+    return trimesh.Trimesh(vertices, faces, vertex_colors=colours, process=False)
 
 
 def _wxyz(turn: np.ndarray) -> tuple[float, ...]:
