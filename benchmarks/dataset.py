@@ -134,25 +134,33 @@ def actors(parents: set[int]) -> list[int]:
 
 
 @contextlib.contextmanager
-def memory(parents: set[int], match: str) -> Iterator[dict[str, float]]:
-    """Highest resident memory [MB] of processes below others, seen twice a second."""
-    seen, ended = {"peak": 0.0}, threading.Event()
+def watched(match: str) -> Iterator[dict[str, float]]:
+    """Highest resident memory [MB] of the workers among the processes below, and processor time of all [s]."""
+    seen, spent, ended = {"peak_mb": 0.0}, {}, threading.Event()
+    begin, ticks = time.process_time(), os.sysconf("SC_CLK_TCK")
 
-    def look() -> None:
+    def look(process: int, title: str) -> None:
+        fields = Path(f"/proc/{process}/stat").read_text().rsplit(")", 1)[1].split()
+        spent[process] = (int(fields[11]) + int(fields[12])) / ticks
+        if match in title:
+            lines = Path(f"/proc/{process}/status").read_text().splitlines()
+            peak = next(int(line.split()[1]) for line in lines if line.startswith("VmHWM")) / 1024
+            seen["peak_mb"] = max(seen["peak_mb"], peak)
+
+    def watch() -> None:
         while not ended.wait(0.5):
-            for process in [one for one, title in children(parents).items() if match in title]:
+            for process, title in children({os.getpid()}).items():
                 with contextlib.suppress(OSError, IndexError, StopIteration):
-                    lines = Path(f"/proc/{process}/status").read_text().splitlines()
-                    peak = next(int(line.split()[1]) for line in lines if line.startswith("VmHWM")) / 1024
-                    seen["peak"] = max(seen["peak"], peak)
+                    look(process, title)
 
-    thread = threading.Thread(target=look, daemon=True)
+    thread = threading.Thread(target=watch, daemon=True)
     thread.start()
     try:
         yield seen
     finally:
         ended.set()
         thread.join()
+        seen["cpu_seconds"] = sum(spent.values()) + time.process_time() - begin
 
 
 def disturbed(source: Path, out: Path, kills: int, shards: int) -> dict:
@@ -164,20 +172,18 @@ def disturbed(source: Path, out: Path, kills: int, shards: int) -> dict:
     second = cluster.add_node(num_cpus=4)
     ray.init(cluster.address, log_to_driver=False)
     told, ended = {"workers_killed": 0, "nodes_killed": 0}, threading.Event()
-    raylets = {os.getpid()}
 
     def disturb() -> None:
-        due = [round((k + 1) * shards / (kills + 2)) for k in range(kills)]
+        due = [round(k * 0.8 * shards / kills) for k in range(kills)]
         while not ended.wait(0.1):
-            done = len([*out.glob("shards/*.json")])
-            if due and done >= due[0] and (running := actors(raylets)):
+            done, running = len([*out.glob("shards/*.json")]), actors({os.getpid()})
+            if due and done >= due[0] and running:
                 os.kill(random.choice(running), signal.SIGKILL)
                 told["workers_killed"] += 1
                 due.pop(0)
-            if done >= shards // 2 and not told["nodes_killed"]:
+            if done >= 0.4 * shards and not told["nodes_killed"]:
                 told["nodes_killed"] += 1
                 cluster.remove_node(second, allow_graceful=False)
-                cluster.add_node(num_cpus=4)
 
     thread = threading.Thread(target=disturb, daemon=True)
     thread.start()
@@ -214,9 +220,9 @@ def flatness(folder: Path, lengths: list[int]) -> dict[str, float]:
         clip = amass(rng, 0)
         keys = {name: np.resize(clip[name], (frames, clip[name].shape[1])) for name in ("poses", "trans")}
         np.savez(source / "long.npz", **clip | keys)
-        with memory({os.getpid()}, "spawn") as seen:
+        with watched("spawn_main") as seen:
             convert(source, out, "local", 1)
-        found[str(frames)] = round(seen["peak"])
+        found[str(frames)] = round(seen["peak_mb"])
     return found
 
 
@@ -242,17 +248,13 @@ def main() -> None:
     if not source.exists():
         make(source, given.frames, given.fits)
     report = {"frames": given.frames, "clips": given.frames // CLIP}
-    with memory({os.getpid()}, "spawn") as seen:
-        report["local"], seconds = convert(source, given.out / "local", "local", 2)
+    for engine, title in (("local", "spawn_main"), ("ray", "ray::MapWorker")):
+        with watched(title) as seen:
+            counts, seconds = convert(source, given.out / engine, engine, 2)
+        report[engine] = {**counts, "seconds": seconds, **seen}
     plain = digests(given.out / "local")
-    report |= {"local_seconds": seconds, "local_peak_mb": seen["peak"], "shards": len(plain)}
-    with memory({os.getpid()}, "ray::") as seen:
-        report["ray"], seconds = convert(source, given.out / "ray", "ray", 2)
-    report |= {
-        "ray_seconds": seconds,
-        "ray_peak_mb": seen["peak"],
-        "ray_over_local": seconds / report["local_seconds"],
-    }
+    report["shards"] = len(plain)
+    report["ray_over_local"] = report["ray"]["cpu_seconds"] / report["local"]["cpu_seconds"]
     report["disturbed"] = disturbed(source, given.out / "faults", given.kills, len(plain))
     report["driver_killed"] = driver_killed(source, given.out / "killed", len(plain))
     report["peak_mb_by_frames"] = flatness(given.out, given.lengths)
