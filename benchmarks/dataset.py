@@ -135,7 +135,7 @@ def actors(parents: set[int]) -> list[int]:
 
 @contextlib.contextmanager
 def watched(match: str) -> Iterator[dict[str, float]]:
-    """Highest resident memory [MB] of the workers among the processes below, and processor time of all [s]."""
+    """Highest memory [MB] of the workers among the processes below, and processor time of all of them [s]."""
     seen, spent, ended = {"peak_mb": 0.0}, {}, threading.Event()
     begin, ticks = time.process_time(), os.sysconf("SC_CLK_TCK")
 

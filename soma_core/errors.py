@@ -15,6 +15,7 @@ class SomaError(Exception):
 
 def _restored(kind: type[SomaError], args: tuple[object, ...], names: dict[str, object]) -> SomaError:
     error = kind.__new__(kind, *args)
+    error.args = args  # an OSError takes them from its constructor alone
     vars(error).update(names)
     return error
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import importlib.util
 import os
+import pickle
 import subprocess
 import sys
 
@@ -182,6 +183,13 @@ def test_a_full_disk_ends_the_run_and_keeps_what_is_finished(data, tmp_path, her
     assert digests(tmp_path / "out") == digests(tmp_path / "plain")
 
 
+def test_a_full_disk_is_told_in_another_process():
+    error = UnwritableError("out/a.npz", OSError(errno.ENOSPC, "No space left on device"))
+    again = pickle.loads(pickle.dumps(error))
+    assert (str(again), again.path, type(again)) == (str(error), "out/a.npz", UnwritableError)
+    assert "cannot be written (No space left on device)" in str(again)
+
+
 def test_a_full_disk_below_a_clip_is_no_broken_clip(data, tmp_path, here, monkeypatch):
     def full(path):
         if path.is_file():
@@ -297,6 +305,18 @@ def test_processes_mirror_a_folder_as_one_does(data, tmp_path):
     )  # fmt: skip
     for name, one in plain.converted.items():
         np.testing.assert_array_equal(found.converted[name].motion().rotations, one.motion().rotations)
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(importlib.util.find_spec("ray") is None, reason="needs soma-body-core[ray]")
+def test_ray_up_takes_the_example_of_a_cluster():
+    code = (
+        "import sys, yaml; from ray.autoscaler._private.util import prepare_config, validate_config; "
+        "validate_config(prepare_config(yaml.safe_load(open(sys.argv[1]))))"
+    )
+    file = assets_dir().parent / "docs/cluster.yaml"
+    found = subprocess.run([sys.executable, "-c", code, file], capture_output=True, text=True)
+    assert found.returncode == 0, found.stderr
 
 
 _ON_RAY = """
