@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     import pyarrow as pa
     from ray.data import Dataset
 
-__all__ = ["ShardJob", "ShardsConverted", "convert_dataset", "convert_shards"]
+__all__ = ["ShardJob", "ShardsConverted", "clip_count", "convert_dataset", "convert_shards"]
 
 Entry = tuple[str, int, int]
 """What a shard is made from: a file by its name; of a Parquet file of clips also which rows, else 0, 0."""
@@ -146,14 +146,14 @@ def _entries(source: Path, root: Path, out: Path, size: int) -> Iterator[Entry]:
         if file.is_relative_to(out):
             continue
         name = file.relative_to(root).as_posix()
-        rows = _clip_count(file)
+        rows = clip_count(file)
         if rows is None:
             yield name, 0, 0
         for start in range(0, rows or 0, size):
             yield name, start, min(start + size, rows or 0)
 
 
-def _clip_count(file: Path) -> int | None:
+def clip_count(file: Path) -> int | None:
     """Rows of a Parquet file of clips; None for other files: frames of one person are a file as any other."""
     if file.suffix.lower() != ".parquet":
         return None

@@ -11,7 +11,7 @@ from omegaconf import OmegaConf
 from soma_core.errors import AssetError, InputError, SomaError
 from soma_core.motion.conversion import EVERYONE, convert_file, convert_people
 from soma_core.motion.folder import FolderConverted, convert_folder, is_one_motion
-from soma_core.motion.shards import ShardsConverted, convert_shards
+from soma_core.motion.shards import ShardsConverted, clip_count, convert_shards
 from soma_core.paths import expanded
 
 if TYPE_CHECKING:
@@ -43,6 +43,11 @@ def run(config: DictConfig, output: Path) -> None:
             _say_shards(path, convert_shards(path, output, options=options), output / "report.json")
         elif path.is_dir() and not is_one_motion(path, options):
             _say(path, convert_folder(path, output, options=options), output / "report.json")
+        elif clip_count(path) is not None:
+            raise InputError(
+                "input", got=f"{path.name}, a Parquet file of clips", expected="a motion without output=parquet",
+                fix="Pass output=parquet; frames of SAM 3D Body are under pred_vertices.",
+            )  # fmt: skip
         elif options.engine == "ray":
             raise InputError(
                 "engine", got="ray, for one file", expected="local, which one file is for",

@@ -155,3 +155,18 @@ def test_a_stopped_run_says_how_to_go_on(tmp_path, monkeypatch, caplog):
     with pytest.raises(KeyboardInterrupt):
         run(tmp_path / "m.npz", tmp_path / "out")
     assert f"stopped; the same command with out={tmp_path / 'out'} goes on from here" in caplog.text
+
+
+@pytest.mark.slow
+def test_shards_are_named_and_rows_of_clips_are_told_from_frames(tmp_path, monkeypatch, capsys):
+    pytest.importorskip("pyarrow")
+    monkeypatch.chdir(tmp_path)
+    write_motion(motion(), tmp_path / "m.npz")
+    assert main(["convert", "input=m.npz", "output=parquet", "out=made", "workers=1"]) == EXIT_OK
+    streams = capsys.readouterr()
+    assert streams.out == "made\n"
+    assert "m.npz: 1 converted; 1 shards in" in streams.err
+    assert main(["convert", "input=made/shards/000000.parquet", "out=again"]) != EXIT_OK
+    assert "input: got 000000.parquet, a Parquet file of clips" in capsys.readouterr().err
+    assert main(["convert", "input=m.npz", "engine=ray", "out=again"]) != EXIT_OK
+    assert "engine: got ray, for one file" in capsys.readouterr().err
