@@ -45,7 +45,7 @@ def run(config: DictConfig, output: Path) -> None:
             _say(path, convert_folder(path, output, options=options), output / "report.json")
         elif clip_count(path) is not None:
             raise InputError(
-                "input", got=f"{path.name}, a Parquet file of clips", expected="a motion without output=parquet",
+                "input", got=f"{path.name}, a Parquet file of clips", expected="a motion, for output=folder",
                 fix="Pass output=parquet; frames of SAM 3D Body are under pred_vertices.",
             )  # fmt: skip
         elif options.engine == "ray":
