@@ -21,20 +21,9 @@ from soma_core.testing.synthetic import synthetic_native as native_body
 from tests.plugin.fakes import FakeEntryPoint
 
 __all__ = [
-    "CPU",
-    "TO_NATIVE",
-    "LinearBody",
-    "TinyPlugin",
-    "cube_sphere",
-    "native_body",
-    "randn",
-    "tiny_canonical",
-    "tiny_registry",
-    "tiny_spec",
-    "wrap_vertices",
-    "write_obj",
-    "write_pair",
-]
+    "CPU", "TO_NATIVE", "LinearBody", "TinyPlugin", "cube_sphere", "native_body", "randn", "tiny_canonical",
+    "tiny_registry", "tiny_spec", "wrap_vertices", "write_obj", "write_pair",
+]  # fmt: skip
 
 CPU = torch.device("cpu")
 

@@ -60,21 +60,11 @@ RANKS = [
         "usd_stage",
         "zip_archive",
     },
-    {"geometry", "plugin"},
-    {"kernels", "_inputs", "_derived"},
-    {"rig", "topology", "skeleton", "animation", "correctives"},
-    {"backends", "io"},
-    {"compiled", "points"},
-    {"layer"},
-    {"inversion"},
-    {"native", "registration"},
-    {"view"},
-    {"motion"},
-    {"config", "shape_space", "template", "testing"},
-    {"evaluation", "viewer"},
-    {"tasks"},
-    {"cli"},
-]
+    {"geometry", "plugin"}, {"kernels", "_inputs", "_derived"},
+    {"rig", "topology", "skeleton", "animation", "correctives"}, {"backends", "io"}, {"compiled", "points"},
+    {"layer"}, {"inversion"}, {"native", "registration"}, {"view"}, {"motion"},
+    {"config", "shape_space", "template", "testing"}, {"evaluation", "viewer"}, {"tasks"}, {"cli"},
+]  # fmt: skip
 RANK = {name: rank for rank, names in enumerate(RANKS) for name in names}
 
 # Lists of names that are loaded when they are first used; they follow no arrow.
