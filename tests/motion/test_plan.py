@@ -42,6 +42,7 @@ def body(tmp_path_factory):
     return file
 
 
+@pytest.mark.slow
 def test_chunks_of_a_plan_are_fitted_in_another_process(body, tmp_path):
     options = InvertOptions(**SETTINGS)
     plan = plan_fit(body, tmp_path / "plan", options=options)
