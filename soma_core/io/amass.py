@@ -66,6 +66,7 @@ class SmplMotion:
         flat_hands: whether zero is a flat hand; False: the model's mean hand.
         hand_components: (frames, 2 n) coefficients of the model's own components of both hands, left first,
             which its fingers turn by as well; None for none.
+        expression: (frames, k) coefficients of the face of SMPL-X; None where there are none.
         source: where it came from.
 
     Raises:
@@ -83,6 +84,7 @@ class SmplMotion:
     camera_turns: np.ndarray | None = None
     flat_hands: bool = True
     hand_components: np.ndarray | None = None
+    expression: np.ndarray | None = None
     source: str = ""
 
     def __post_init__(self) -> None:
@@ -135,7 +137,8 @@ def write_amass(
 ) -> None:
     """Write `motion` in the layout of AMASS, atomically.
 
-    SMPL-X files get ``poses`` and its parts and ``mocap_frame_rate``, the others ``poses`` and
+    SMPL-X files get ``poses`` and its parts, ``mocap_frame_rate`` and, with a face that moves,
+    ``expressions``; the others ``poses`` and
     ``mocap_framerate``, as those of AMASS do.
 
     Args:
@@ -158,6 +161,8 @@ def write_amass(
         }
         values |= {"mocap_frame_rate": motion.fps, _SECONDS: motion.frame_count / motion.fps}
         values["num_betas"] = len(motion.betas)
+        if motion.expression is not None:
+            values["expressions"] = motion.expression
     else:
         values["mocap_framerate"] = motion.fps
     _write(path, values, extra)
@@ -169,8 +174,8 @@ def write_smplx(
     """Write `motion` under the names that the models' own code takes, atomically.
 
     ``global_orient`` (frames, 3), ``body_pose`` (frames, 69 for SMPL, else 63), ``transl`` (frames, 3),
-    ``betas`` (1, k); for SMPL-X ``jaw_pose``, ``leye_pose``, ``reye_pose`` and an ``expression`` of zeros
-    (frames, 10); with hands ``left_hand_pose`` and ``right_hand_pose`` (frames, 45). ``flat_hand_mean`` and
+    ``betas`` (1, k); for SMPL-X ``jaw_pose``, ``leye_pose``, ``reye_pose`` and ``expression``
+    (frames, k); with hands ``left_hand_pose`` and ``right_hand_pose`` (frames, 45). ``flat_hand_mean`` and
     ``use_pca`` say how a model has to be made for them; also ``gender``, ``fps``, ``surface_model_type``.
 
     Args:
@@ -189,7 +194,8 @@ def write_smplx(
         end += width
     values |= {"transl": motion.translation, "betas": motion.betas[None]}
     if motion.model == "smplx":
-        values["expression"] = np.zeros((motion.frame_count, _EXPRESSIONS), np.float32)
+        still = np.zeros((motion.frame_count, _EXPRESSIONS), np.float32)
+        values["expression"] = still if motion.expression is None else motion.expression
     if motion.model != "smpl":
         values |= {"flat_hand_mean": True, "use_pca": False}
     values |= {"gender": motion.gender, "surface_model_type": motion.model, "fps": motion.fps}

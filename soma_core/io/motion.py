@@ -36,6 +36,8 @@ class Motion:
             heel, right toes; None if unknown.
         skeleton: (77, 3) float32 from the parent to each joint in the T-pose [m], of the body that was
             recorded; NaN for a joint whose bone is unknown, None if all are.
+        expression: (frames, k) float32 coefficients of the face of the body's own model, which this skeleton
+            has only a jaw for; None without.
 
     Raises:
         InputError: a shape, a value, the frame rate or the convention cannot be a motion.
@@ -52,6 +54,7 @@ class Motion:
     licence: str = ""
     contacts: np.ndarray | None = None
     skeleton: np.ndarray | None = None
+    expression: np.ndarray | None = None
 
     def __post_init__(self) -> None:
         rotations = np.asarray(self.rotations, np.float32)
@@ -85,6 +88,10 @@ class Motion:
             contacts = np.asarray(self.contacts, bool)
             _expect("contacts", contacts, (frames, len(CONTACT_JOINTS)))
             object.__setattr__(self, "contacts", contacts)
+        if self.expression is not None:
+            expression = np.asarray(self.expression, np.float32)
+            _expect("expression", expression, (frames, expression.shape[-1] if expression.ndim else 0))
+            object.__setattr__(self, "expression", expression)
         if self.skeleton is not None:
             skeleton = np.asarray(self.skeleton, np.float32)
             _expect("skeleton", np.nan_to_num(skeleton, nan=0.0), (len(self.joint_names), 3))
@@ -101,10 +108,9 @@ class Motion:
         Args:
             frames: a slice, or numbers of frames.
         """
-        contacts = None if self.contacts is None else self.contacts[frames]
-        return replace(
-            self, rotations=self.rotations[frames], translation=self.translation[frames], contacts=contacts
-        )
+        names = ("rotations", "translation", "contacts", "expression")
+        kept = {name: value for name in names if (value := getattr(self, name)) is not None}
+        return replace(self, **{name: value[frames] for name, value in kept.items()})
 
 
 def _expect(argument: str, array: np.ndarray, shape: tuple[int, ...]) -> None:

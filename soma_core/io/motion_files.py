@@ -25,7 +25,12 @@ from soma_core.io.soma_npz import SCHEMA_VERSION, read_soma_npz
 
 __all__ = ["check_rig", "read_motion", "samples_of", "write_motion", "write_motion_parts"]
 
-_LONG = {"poses": "rotations", "transl": "translation", "foot_contacts": "contacts"}
+_LONG = {
+    "poses": "rotations",
+    "transl": "translation",
+    "foot_contacts": "contacts",
+    "expression": "expression",
+}
 """Keys of a file that hold an entry a frame, and the field of a motion that they come from."""
 
 
@@ -191,7 +196,9 @@ def _arrays(motion: Motion, rotation_repr: str) -> dict[str, np.ndarray]:
         "source": motion.source,
         "licence": motion.licence,
     }
-    recorded = {"foot_contacts": motion.contacts, "skeleton": motion.skeleton}
+    recorded = {
+        "foot_contacts": motion.contacts, "skeleton": motion.skeleton, "expression": motion.expression
+    }  # fmt: skip
     values |= _identity(motion.identity) | {name: kept for name, kept in recorded.items() if kept is not None}
     return {name: np.asarray(value) for name, value in values.items()}
 

@@ -167,14 +167,8 @@ def _say_choice(file: DataFile, bodies: Sequence[FoundBody], body: FoundBody) ->
     if len(spaces) > 1:
         space = body.space or next(name for name in ("world", "camera") if name not in spaces)
         other = "camera" if space == "world" else "world"
-        _log.info(
-            "%s: %s%s: motion in the %s; coordinates=%s for the other",
-            file.path.name,
-            tool,
-            whose,
-            space,
-            other,
-        )
+        told = file.path.name, tool, whose, space, other
+        _log.info("%s: %s%s: motion in the %s; coordinates=%s for the other", *told)
     elif body.tool or whose:
         _log.info("%s: %s%s", file.path.name, tool, whose)
 
@@ -205,7 +199,8 @@ class _Reading:
         if self._camera is not None:
             turned, path = in_world(self._camera, turned, path, rows if numbers is None else numbers[rows])
             _log.info("%s: in the world by %s; or coordinates=camera", self._file.path.name, self._camera)
-        moving = np.concatenate([path, pose.hands[rows]], axis=1)
+        face = self._parts.expression(pose.frames) if pose.model == "smplx" else np.zeros((pose.frames, 0))
+        moving = np.concatenate([path, pose.hands[rows], face[rows]], axis=1)
         turned, moving = self._without_gaps(turned, moving, times, fps, len(whole))
         rotations = turned[:, : pose.rotations.shape[1]]
         flat = choices.flat_hand_mean
@@ -215,7 +210,8 @@ class _Reading:
             about=self._tool.about if self._tool else "pelvis",
             camera_turns=None if self._camera is None else turned[:, -1],
             flat_hands=self._parts.flag("flat", default=not pose.hands.size) if flat is None else flat,
-            hand_components=moving[:, 3:],
+            hand_components=moving[:, 3 : 3 + pose.hands.shape[1]],
+            expression=moving[:, moving.shape[1] - face.shape[1] :] if face.any() else None,
             source=self._file.path.name,
         )  # fmt: skip
 

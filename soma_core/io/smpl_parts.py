@@ -101,6 +101,17 @@ class BodyParts:
             fix="Pass betas=[0,0,0] (or the true ones).",
         )  # fmt: skip
 
+    def expression(self, frames: int) -> np.ndarray:
+        """Rows (frames, k) of coefficients of the face, missing ones zero; k = 0 where none can be read."""
+        try:
+            values = np.nan_to_num(self.numbers("expression")) if "expression" in self else np.zeros(0)
+        except InputError:
+            values = np.zeros(0)
+        rows = values.reshape(-1, values.shape[-1]) if values.size and values.ndim else np.zeros((1, 0))
+        if len(rows) not in (1, frames):
+            return np.zeros((frames, 0))
+        return np.broadcast_to(rows, (frames, rows.shape[1]))
+
     def number(self, part: str) -> float:
         """One number of a part."""
         values = self.numbers(part)

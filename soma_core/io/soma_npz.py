@@ -65,6 +65,7 @@ def read_soma_npz(
         licence=fields.text("licence", ""),
         contacts=_contacts(fields, len(rotations)) if ours else None,
         skeleton=_skeleton(fields, metres) if ours else None,
+        expression=_expression(fields, len(rotations)) if ours else None,
     )
 
 
@@ -73,6 +74,11 @@ def _contacts(fields: NpzFields, frames: int) -> np.ndarray | None:
     if "foot_contacts" not in fields:
         return None
     return fields.numbers("foot_contacts", (frames, len(CONTACT_JOINTS))) > LIKELY_CONTACT
+
+
+def _expression(fields: NpzFields, frames: int) -> np.ndarray | None:
+    """Coefficients of the face (frames, k) of the body's own model, where the file has them."""
+    return fields.numbers("expression", (frames, "coefficients")) if "expression" in fields else None
 
 
 def _skeleton(fields: NpzFields, metres: float) -> np.ndarray | None:

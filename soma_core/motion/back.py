@@ -74,6 +74,8 @@ class BackConverter:
             )  # fmt: skip
             layer, stored = self._bodies.layer_of(path, motion)
             target, placing = self._target(stored), placing_of(options)
+            if isinstance(target, SmplTarget) and (stored["backend"], target.model) == ("smplx", "smplx"):
+                target = replace(target, expression=motion.expression)
             own = "" if options.backend is None else "backend.params."
             say(path.name, of_motion(motion) + of_params(layer.spec, stored.get("params", {}), setting=own))
             if isinstance(target, SmplTarget) and options.betas is not None:

@@ -53,6 +53,7 @@ class ShownBody:
         facts: what else decides the result, for the report.
         licence: of the motion.
         doubts: what is doubtful about it, for the log and the report.
+        expression: (frames, k) coefficients of its face, which no fit of this skeleton finds; None without.
     """
 
     backend: FitBackend
@@ -62,6 +63,7 @@ class ShownBody:
     facts: Mapping[str, Any]
     licence: str = ""
     doubts: tuple[str, ...] = ()
+    expression: np.ndarray | None = None
 
 
 def open_body(path: Path, layout: str, options: FitOptions, backends: FitBackends | None = None) -> ShownBody:
@@ -166,6 +168,7 @@ def _smpl_body(path: Path, options: ConvertOptions, backends: FitBackends) -> Sh
         facts={"up": motion.up, **chosen_reading(options), **_units(options)},
         licence=f"that of {path.name}; body model: {backend.layer.spec.licence}",
         doubts=tuple(of_smpl(motion) + of_params(backend.layer.spec, params, setting="")),
+        expression=motion.expression,
     )
 
 

@@ -203,6 +203,7 @@ def resample(motion: Motion, fps: float) -> Motion:
         rotations=np.stack(turned, axis=1),
         translation=CubicSpline(own, motion.translation.astype(np.float64))(times),
         contacts=None if motion.contacts is None else motion.contacts[nearest],
+        expression=None if motion.expression is None else motion.expression[nearest],
         fps=float(fps),
     )
 
@@ -231,6 +232,7 @@ def mirror(motion: Motion) -> Motion:
         contacts=None if motion.contacts is None else motion.contacts[:, [2, 3, 0, 1]],
         skeleton=None if motion.skeleton is None else motion.skeleton[other] * flip,
         identity=_mirrored_rest(motion.identity),
+        expression=None,  # a face's coefficients have no mirror image
     )
 
 

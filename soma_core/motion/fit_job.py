@@ -203,7 +203,7 @@ class FitJob:
         write_motion_parts(
             lambda: fitted_motions(
                 chunks, layer, fps=plan.settings["fps"], source=source, identity=identity,
-                skeleton=skeleton, licence=self.body.licence,
+                skeleton=skeleton, licence=self.body.licence, expression=self.body.expression,
             ),
             files.motion,
             frame_count=chunks.frame_count,

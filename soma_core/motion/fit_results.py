@@ -95,9 +95,13 @@ def fitted_motions(
     identity: Mapping[str, Any],
     skeleton: np.ndarray | None = None,
     licence: str = "",
+    expression: np.ndarray | None = None,
 ) -> Iterator[Motion]:
-    """The fitted motion, a chunk at a time; `skeleton` is that of the identity."""
-    for rotations, translation in chunks.load_all("rotations", "translation"):
+    """The fitted motion, a chunk at a time; `skeleton` and `expression` of all frames."""
+    ranges = (slice(*ends) for ends in chunks.ranges)
+    for part, (rotations, translation) in zip(
+        ranges, chunks.load_all("rotations", "translation"), strict=True
+    ):
         yield Motion(
             rotations=rotations,
             translation=translation,
@@ -108,6 +112,7 @@ def fitted_motions(
             identity=identity,
             skeleton=skeleton,
             licence=licence,
+            expression=None if expression is None else expression[part],
         )
 
 

@@ -121,6 +121,7 @@ class SmplTarget:
         up: upward axis of the world that is written.
         width: shape coefficients that are written; None: those of the body, or of the model.
         layout: ``amass`` or ``smplx``, the names of the keys.
+        expression: (frames, k) coefficients of the face that the motion keeps of its own SMPL-X.
     """
 
     fit: NativeFit
@@ -131,6 +132,7 @@ class SmplTarget:
     up: UpAxis
     width: int | None = None
     layout: str = "amass"
+    expression: np.ndarray | None = None
 
     def __post_init__(self) -> None:
         """Leave out coefficients that are not to be written: poses then make up for what they can."""
@@ -176,8 +178,9 @@ class SmplTarget:
         """Write ``files.motion`` in the layout of AMASS or with the names of smplx, and ``files.frames``."""
         columns = {name: np.concatenate(list(_column(chunks, name))) for name in ("rotations", "translation")}
         motion = SmplMotion(
-            model=self.model, **columns, betas=self._betas(), gender=self.gender, fps=fps, up=self.up
-        )
+            model=self.model, **columns, betas=self._betas(), gender=self.gender, fps=fps, up=self.up,
+            expression=self.expression,
+        )  # fmt: skip
         extra = {"source": np.array(source), "up_axis": np.array(self.up[1:].upper())}
         (write_amass if self.layout == "amass" else write_smplx)(motion, files.motion, extra=extra)
         (determined,) = chunks.load(0, "determined")

@@ -119,12 +119,23 @@ def heard() -> Iterator[list[str]]:
 
 def of_smpl(motion: SmplMotion) -> list[str]:
     """What is doubtful about a motion of the SMPL family: its angles, axes, lengths, speed and frame rate."""
-    degrees = degrees_doubt(motion.rotations)
+    degrees, face = degrees_doubt(motion.rotations), _of_face(motion.expression)
     if degrees:
-        return [degrees, *of_rate(motion.fps)]  # where the body points is not known
+        return [degrees, *of_rate(motion.fps), *face]  # where the body points is not known
     upward = Rotation.from_rotvec(motion.rotations[:, 0]).apply([0, 1, 0])
     lies = _of_axes(upward, motion.up, Names().ups)
-    return of_rate(motion.fps) + (lies or of_path(motion.translation, motion.fps, up=motion.up, what="trans"))
+    path = lies or of_path(motion.translation, motion.fps, up=motion.up, what="trans")
+    return of_rate(motion.fps) + path + face
+
+
+def _of_face(expression: np.ndarray | None) -> list[str]:
+    """What becomes of the coefficients of a face."""
+    if expression is None:
+        return []
+    return [
+        f"its expressions, {expression.shape[1]} coefficients, are left out: this skeleton has a jaw alone; "
+        "a fitted motion.npz keeps them for to=smplx"
+    ]
 
 
 def of_motion(motion: Motion, names: Names | None = None) -> list[str]:

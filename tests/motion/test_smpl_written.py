@@ -135,6 +135,30 @@ def test_there_and_back_as_close_as_the_models_allow(motion_file, tmp_path):
     assert len(read_motion(tmp_path / "back/motion.npz").identity["params"]["betas"]) == 10
 
 
+@pytest.mark.parametrize(("layout", "key"), [("amass", "expressions"), ("smplx", "expression")])
+def test_the_face_comes_back_where_the_model_is_the_same(layout, key, motion_file, tmp_path):
+    """Coefficients of SMPL-X are kept beside the motion of its body, which moves the jaw alone."""
+    options = ConvertOptions(to="smplx", lod="low", layout=layout)
+    convert_file(motion_file, tmp_path / "a", options=options)
+    with np.load(tmp_path / "a/motion.npz") as file:
+        content = dict(file)
+    assert not np.any(content.pop(key, 0))
+    frames = len(content["trans" if layout == "amass" else "transl"])
+    face = np.random.default_rng(1).normal(size=(frames, 50)).astype(np.float32)
+    np.savez(tmp_path / "face.npz", **content, **{key: face})
+    found = convert_file(tmp_path / "face.npz", tmp_path / "b", options=ConvertOptions(lod="low", chunk=3))
+    assert any("50 coefficients, are left out" in text for text in found.report["warnings"])
+    np.testing.assert_array_equal(found.motion().expression, face)
+    np.testing.assert_array_equal(found.motion().cut(slice(1, 3)).expression, face[1:3])
+    convert_file(tmp_path / "b/motion.npz", tmp_path / "c", options=options)
+    with np.load(tmp_path / "c/motion.npz") as file:
+        np.testing.assert_array_equal(file[key], face)
+    options = ConvertOptions(to="smplh", lod="low")
+    convert_file(tmp_path / "b/motion.npz", tmp_path / "d", options=options)
+    with np.load(tmp_path / "d/motion.npz") as file:
+        assert key not in file
+
+
 def test_fewer_betas_than_the_body_has_are_said(motion_file, tmp_path, caplog):
     with caplog.at_level(logging.WARNING):
         options = ConvertOptions(to="smplx", lod="low", num_betas=1)
