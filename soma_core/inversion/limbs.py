@@ -45,6 +45,9 @@ _DEAR = 5e-4
 _SHARES, _SHARES_NEAR = 25, 9
 """Shares looked at, evenly over a whole turn, and of these those about what a search found before."""
 
+_IN_CACHE = 32
+"""Frames whose activations at every share stay in a processor's cache."""
+
 
 class LimbStart(torch.nn.Module):
     """Turns of the joints that helpers hang on, from the clouds of the helpers.
@@ -254,13 +257,14 @@ class TwistShare:
         basis = torch.stack((turns @ across, turns @ (across @ across)), 2)  # (F, h, 2, 3, 3)
         part = torch.stack((torch.sin(spin), 1 - torch.cos(spin)), -1)  # (F, a, h, 2)
         pulled = (basis * view.residual[:, limb.clouds, None, :, :3]).sum((-2, -1))  # (F, h, 2)
-        energy = 2 * torch.einsum("fahx,fhx->fa", part, pulled)
         first, second = basis[:, limb.first], basis[:, limb.second]
         moved = first @ rest.second[:, limb.pairs, None, :3, :3]
         product = torch.einsum("fqxab,fqyab->fqxy", moved, second)
         product = product * torch.where(limb.first == limb.second, 1.0, 2.0).to(product)[:, None, None]
-        both = torch.einsum("faqx,fqxy->faqy", part[:, :, limb.first], product)
-        energy = energy + (both * part[:, :, limb.second]).sum((-2, -1))
+        square = product.new_zeros(len(product), *(2 * [len(limb.helpers)]), 2, 2)
+        square[:, limb.first, limb.second] = product
+        square, part = square.transpose(2, 3).flatten(3, 4).flatten(1, 2), part.flatten(2)
+        energy = (part * (part @ square + 2 * pulled.flatten(1)[:, None])).sum(-1)
         jumping = (clear[:, :-1] < _CLEAR).any(-1)
         return energy + jumping * (_DEAR**2 * rest.own[..., 3, 3].sum(1))[:, None]
 
@@ -314,12 +318,16 @@ class TwistShare:
         own = self.offsets.features(relative[:, limb.own, None] @ turn, limb.own)
         end = self.offsets.features(turn.mT @ relative[:, limb.end, None], limb.end)
         still = [self.offsets.features(relative[:, joint, None], joint) for joint in (limb.own, limb.end)]
-        seen = torch.cat((own - still[0], end - still[1]), -1) @ torch.cat((limb.by_own, limb.by_end), 1).T
-        before = view.activity.before[:, None, limb.ids]
-        moved = self.offsets.squashed(seen.add_(before)).sub_(self.offsets.squashed(before))
-        square = (moved @ limb.shapes).square().sum(-1)
-        pulled = (moved * view.pull[:, None, limb.ids]).sum(-1)
-        return 2 * pulled + scale[:, None].square() * square
+        change = torch.cat((own - still[0], end - still[1]), -1)
+        reads, squashed = torch.cat((limb.by_own, limb.by_end), 1).T, self.offsets.squashed
+        given = change, view.activity.before[:, None, limb.ids], view.pull[:, None, limb.ids]
+        squares, pulls = [], []
+        size = len(change) if change.is_cuda else _IN_CACHE
+        for seen, before, pull in zip(*(one.split(size) for one in given), strict=True):
+            moved = squashed((seen @ reads).add_(before)).sub_(squashed(before))
+            squares.append((moved @ limb.shapes).square().sum(-1))
+            pulls.append((moved * pull).sum(-1))
+        return 2 * torch.cat(pulls) + scale[:, None].square() * torch.cat(squares)
 
 
 def _lowest(angle: Tensor, energy: Tensor) -> Tensor:
