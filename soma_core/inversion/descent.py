@@ -60,7 +60,8 @@ def descended(
     if doubt is not None:
         known = model.solver.columns(doubt.variable), doubt.axis.contiguous(), doubt.square
     while True:
-        made = tuple(step for step in range(begin, end + 1) if renewed(step))
+        # Frames that go on get a matrix anyway; where one step is the last of most, its own one judges it.
+        made = tuple(step for step in range(begin, end + (at_once == 1)) if renewed(step))
         frames = len(rows)
         found = descend(
             model.steps, model.constants(problem.rest), model.residual.tables, rule, known,

@@ -33,7 +33,7 @@ _LOWER, _RAISE, _LEAST_RAISED, _MOST_DAMPING = 0.1, 10.0, 1e-4, 1e4
 """Levenberg damping relative to the diagonal: start, factors after a good and a bad step, least value after a
 bad one, largest."""
 
-_EARLY, _EVERY = (0, 1), (5, 3)
+_EARLY, _EVERY = (0, 1, 3, 5), (5, 3)
 """Steps at which the matrix is made anew: the first ones, and those that leave the second of these numbers
 when divided by the first. In between, the memory makes up for what changes."""
 
