@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from soma_core.inversion.fit import PoseInversion
     from soma_core.inversion.identity import IdentityFit, fit_identity
     from soma_core.inversion.point_fit import PointResult
+    from soma_core.inversion.point_identity import fit_point_identity
     from soma_core.inversion.point_priors import JointPrior, JointRange
     from soma_core.inversion.points import PointInversion
     from soma_core.inversion.priors import HINGES, PosePriors
@@ -95,6 +96,7 @@ __all__ = [
     "default_registry",
     "diagnose_fit",
     "fit_identity",
+    "fit_point_identity",
     "load_canonical",
     "load_point_set",
     "load_shape_space",
@@ -134,6 +136,7 @@ _HOMES = {
     "soma_core.inversion.autograd": ["AutogradOptions"],
     "soma_core.inversion.points": ["PointInversion"],
     "soma_core.inversion.point_fit": ["PointResult"],
+    "soma_core.inversion.point_identity": ["fit_point_identity"],
     "soma_core.inversion.point_priors": ["JointPrior", "JointRange"],
     # Named points: keypoints, markers, joints of other rigs
     "soma_core.points.point_set": ["Point", "PointSet", "load_point_set"],

@@ -95,6 +95,7 @@ PUBLIC_NAMES = {
         ParameterFit Point PointInversion PointResult PointSet PoseInversion PosePriors
         Posed Rig Sam3dFrames ShapeSpace SkinnedClip SmplChoices SmplMotion SomaError SomaLayer USER_JOINTS
         VertexSequence __version__ assets_dir canonical_landmarks default_registry diagnose_fit fit_identity
+        fit_point_identity
         load_canonical load_point_set load_shape_space
         open_vertex_sequence read_amass read_camera read_cameras read_motion read_sam3d read_smpl
         skinned_clip write_amass write_gltf

@@ -105,9 +105,13 @@ class PointRows:
         """What is minimised, (F,), or (1,) of all frames together."""
         return self._system(pose, slice(0, len(pose.translation)))[0]
 
+    def system(self, pose: Pose) -> tuple[Tensor, Tensor]:
+        """Matrix (F, d, d) and half the slope (F, d), each frame's matrix on its own."""
+        return self._system(pose, slice(0, len(pose.translation)))[1]
+
     def _inverse(self, pose: Pose) -> tuple[Tensor, Tensor]:
         """Matrix (F, d, d) of each frame on its own, and its inverse, float64."""
-        matrix = self._system(pose, slice(0, len(pose.translation)))[1][0].double()
+        matrix = self.system(pose)[0].double()
         diagonal = matrix.diagonal(dim1=-2, dim2=-1)
         ridge = _RIDGE * (diagonal + diagonal.mean(1, keepdim=True))
         factor, _ = torch.linalg.cholesky_ex(matrix + torch.diag_embed(ridge))

@@ -99,6 +99,7 @@ class PointInversion(Derived):
         bone_scale: Tensor | None = None,
         initial: InversionResult | None = None,
         fps: float | None = None,
+        noise: float | None = None,
         cameras: Camera | Sequence[Camera] | None = None,
     ) -> PointResult:
         """Fit every frame, on its own unless `fps` is given.
@@ -113,6 +114,7 @@ class PointInversion(Derived):
             initial: an earlier result for these frames, to begin from.
             fps: frames per second of one motion: joints then turn at their usual pace, and frames with too
                 few points, which are not `valid`, are bridged. None for frames that are apart.
+            noise: instead of that of the inversion.
             cameras: that see the points, one or V. `noise`, ``point_error`` (the mean over the views) and
                 ``residual`` are then in pixels, and the size of the body has to be known for one view.
 
@@ -130,7 +132,7 @@ class PointInversion(Derived):
             scale = check_bone_scale(bone_scale, count, joints, layer.dtype, layer.device)
             with torch.no_grad():
                 return ViewFit(
-                    self.model, self.start, views, identity, scale, noise=self.noise, fps=fps
+                    self.model, self.start, views, identity, scale, noise=noise or self.noise, fps=fps
                 )(initial)  # fmt: skip
         points = self._checked(points)
         count = len(points)
@@ -142,7 +144,7 @@ class PointInversion(Derived):
                 weights = weights * known
             clean = torch.where(known[..., None], points, 0.0)
             fit = PointFit(
-                self.model, self.start, clean, weights, identity, bone_scale, noise=self.noise,
+                self.model, self.start, clean, weights, identity, bone_scale, noise=noise or self.noise,
                 iterations=self.iterations,
             )  # fmt: skip
             fit.begin(initial)
@@ -199,8 +201,7 @@ class PointInversion(Derived):
         """
         layer = self.layer
         if cameras is not None:
-            places, met = self._views(points, cameras, None).triangulated()
-            points = torch.where(met[..., None] > 0, places, torch.nan)
+            points, _ = self.triangulated(points, cameras)
         points = self._checked(points)
         length = layer.animation.bone_vectors(identity).norm(dim=-1)[0]
         centre, parents = self.start.centre, layer.rig.parents
@@ -218,6 +219,13 @@ class PointInversion(Derived):
         known = {name: sum(values) / len(values) for name, values in seen.items()}
         factors = [known.get(_sideless(name), whole) for name in layer.joint_names]
         return points.new_tensor([factors])
+
+    def triangulated(
+        self, points: Tensor, cameras: Sequence[Camera], weights: Tensor | None = None
+    ) -> tuple[Tensor, Tensor]:
+        """Places (F, P, 3) [m] where the rays of pixels (V, F, P, 2) meet, NaN where none do; and weights."""
+        places, met = self._views(points, cameras, weights).triangulated()
+        return torch.where(met[..., None] > 0, places, torch.nan), met
 
     def _size(self, points: Tensor, identity: Identity) -> float:
         """Size of a person beside a body, where no bone is seen."""

@@ -17,7 +17,7 @@ from soma_core.inversion.result import InversionResult
 from soma_core.inversion.shape_response import shape_normal_equations
 from soma_core.skeleton.identity import Identity
 
-__all__ = ["Sample", "ShapeFound", "search_parameters"]
+__all__ = ["Sample", "ShapeFound", "bounded_step", "search_parameters"]
 
 _PLAIN, _ROBUST = 1.0, 5e-4
 """Scale of the loss [m]: vertices whose error lies above it count less. The first leaves all alike."""
@@ -184,7 +184,7 @@ class _Search:
             matrix, slope = self._normal_equations(state, trust, prior)
             before = self._objective(state, scale, prior)
             for _ in range(_TRIES):
-                trial = self._state(self._stepped(state.point, matrix, slope, damping), trust)
+                trial = self._state(bounded_step(self.unknowns, state.point, matrix, slope, damping), trust)
                 gain = before - self._objective(trial, scale, prior)
                 if gain > 0:
                     break
@@ -228,13 +228,13 @@ class _Search:
         matrix, slope = left.cpu().numpy() / total, right.cpu().numpy() / total
         return matrix + prior * np.eye(len(slope)), slope + prior * state.point
 
-    def _stepped(
-        self, point: np.ndarray, matrix: np.ndarray, slope: np.ndarray, damping: float
-    ) -> np.ndarray:
-        """The minimum of the damped quadratic inside the bounds."""
-        damped = matrix + damping * np.diag(np.diag(matrix))
-        factor = np.linalg.cholesky(damped)
-        goal = scipy.linalg.solve_triangular(factor, -slope, lower=True)
-        bounds = self.unknowns.lower - point, self.unknowns.upper - point
-        found = scipy.optimize.lsq_linear(factor.T, goal, bounds, method="bvls")
-        return point + found.x
+
+def bounded_step(
+    unknowns: Unknowns, point: np.ndarray, matrix: np.ndarray, slope: np.ndarray, damping: float
+) -> np.ndarray:
+    """The minimum of the damped quadratic inside the bounds."""
+    damped = matrix + damping * np.diag(np.diag(matrix))
+    factor = np.linalg.cholesky(damped)
+    goal = scipy.linalg.solve_triangular(factor, -slope, lower=True)
+    bounds = unknowns.lower - point, unknowns.upper - point
+    return point + scipy.optimize.lsq_linear(factor.T, goal, bounds, method="bvls").x

@@ -358,7 +358,7 @@ def points_to_motion(
     found = from_points(path, options, person=person)
     write(found.motion, files.motion)
     settings = {"input": str(path.resolve()), "layout": "points", "fps": found.motion.fps}
-    report = {"settings": settings, "frames": found.motion.frame_count, "identity": None, **found.report,
+    report = {"settings": settings, "frames": found.motion.frame_count, **found.report,
               "warnings": said}  # fmt: skip
     atomic_text(files.report, json.dumps(report, indent=2) + "\n")
     return Converted(report=report, files=files, written={"npz": files.motion})

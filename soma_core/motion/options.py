@@ -233,7 +233,8 @@ class ConvertOptions(WriteOptions, FitOptions):
                 "result": self.result, "translation": placed, "contacts": held,
                 "ground": None if self.shown else self.ground,
             }  # fmt: skip
-            if self.backend is not None and sought is None and self.backend.name != "mhr" and not self.shown:
+            told = sought is None and self.points is None and not self.shown
+            if self.backend is not None and told and self.backend.name != "mhr":
                 unused["backend"] = self.backend.name  # a file tells its own model
             why = "to=soma" if sought else "to=soma and identity=known"
         for name, value in unused.items():

@@ -11,20 +11,23 @@ import numpy as np
 import torch
 
 from soma_core.errors import InputError
+from soma_core.inversion.point_identity import fit_point_identity
 from soma_core.inversion.points import PointInversion
 from soma_core.io.camera import Camera, read_cameras
 from soma_core.io.motion import Motion
 from soma_core.io.point_files import PointFrames, read_points
-from soma_core.motion.models import open_layer
+from soma_core.motion.identities import kept_identity
+from soma_core.motion.models import open_layer, under
 from soma_core.motion.options import SIGNED, FitOptions
 from soma_core.motion.posed_input import world_axes
 from soma_core.motion.questions import Names, of_motion, of_rate, say
+from soma_core.options import IdentityChoice
 from soma_core.points.point_set import load_point_set
 from soma_core.topology.frames import METRES
 
 if TYPE_CHECKING:
     from soma_core.inversion.point_fit import PointResult
-    from soma_core.layer import SomaLayer
+    from soma_core.skeleton.identity import Identity
 
 __all__ = ["Pointed", "from_points"]
 
@@ -32,6 +35,9 @@ _log = logging.getLogger(__name__)
 
 _SIZES = (0.6, 1.5)
 """A person this much smaller or larger than the body is said; a newborn has 0.3 of an adult."""
+
+_LEAST_FRAMES = 60
+"""A body is found from so many frames of points, or more: each tells little."""
 
 _MISSED, _MISSED_SHARE = 0.05, 0.03
 """Errors that are said: [m], or beside the size of the person in the picture."""
@@ -70,12 +76,9 @@ def from_points(path: Path, options: FitOptions, *, person: str | None = None) -
     layer = open_layer(options, name, given)
     places, scale = _in_metres(path, found, options)
     inversion = PointInversion(layer, points)
-    identity = layer.identity(dict(options.backend.params) if options.backend is not None else {})
-    lengths = None
-    if len(cameras) != 1:
-        lengths = inversion.bone_scale(places, identity, cameras=cameras or None)
     weights = None if found.confidence is None else torch.as_tensor(found.confidence).to(places)
     try:
+        identity, lengths = _body(inversion, places, weights, cameras, options)
         result = inversion(
             places, identity, weights=weights, bone_scale=lengths, fps=fps, cameras=cameras or None
         )
@@ -88,17 +91,63 @@ def from_points(path: Path, options: FitOptions, *, person: str | None = None) -
             str(path), got="three known points in no frame", expected=f"points of {points.name}",
             fix="Look at the order of the points, and at their confidence.",
         )  # fmt: skip
-    motion = _motion(path, layer, result, lengths, fps)
+    kept = {} if options.identity.method == "known" else kept_identity(layer, identity)
+    motion = Motion(
+        rotations=result.rotations.cpu().numpy(), translation=result.translation.cpu().numpy(), fps=fps,
+        joint_names=layer.joint_names, rig_revision=layer.rig.revision, source=str(path), identity=kept,
+        skeleton=layer.animation.bone_vectors(identity, lengths)[0, 1:].cpu().numpy(),
+    )  # fmt: skip
     names = Names(ups=tuple(SIGNED) if options.upward is None else ())
     extent = None if not cameras else _extent(found.positions)
     say(path.name, [*of_motion(motion, names), *_doubts(result, lengths, extent)])
-    report = _report(points.name, found, result, lengths, motion)
+    report = {"identity": kept or None, **_report(points.name, found, result, lengths, motion)}
     noise = f"{1e3 * result.noise:.1f} mm" if extent is None else f"{result.noise:.1f} px"
     _log.info(
         "%s: %s, %d frames of %d points at %g fps; noise %s",
         path.name, found.layout, motion.frame_count, len(points), fps, noise,
     )  # fmt: skip
     return Pointed(motion, report)
+
+
+def _body(
+    inversion: PointInversion,
+    places: torch.Tensor,
+    weights: torch.Tensor | None,
+    cameras: tuple[Camera, ...],
+    options: FitOptions,
+) -> tuple[Identity, torch.Tensor | None]:
+    """The body, and factors of its bones where it is made as long as the points are.
+
+    Raises:
+        InputError: one that is not known is sought by a single view, or vertex by vertex.
+    """
+    params = dict(options.backend.params) if options.backend is not None else {}
+    choice = options.identity
+    if choice.method == "known":
+        body = inversion.layer.identity(params)
+        if len(cameras) == 1:
+            return body, None
+        return body, inversion.bone_scale(places, body, cameras=cameras or None)
+    if choice.method != "backend" or len(cameras) == 1:
+        got = (
+            f"{choice.method} of points" if choice.method != "backend" else "one view, which tells no length"
+        )
+        raise InputError(
+            "identity", got=got, expected="parameters of a backend, from points in space or several views",
+            fix="Pass identity=known, and what is known of the body as backend.params.KEY=VALUE.",
+        )  # fmt: skip
+    if cameras:
+        places, met = inversion.triangulated(places, cameras, weights)
+        weights = met
+    with under(IdentityChoice, "identity"):
+        found = fit_point_identity(
+            inversion, places, weights=weights, start=params, free=choice.free,
+            frames=max(choice.frames, _LEAST_FRAMES), iterations=choice.iterations,
+        )  # fmt: skip
+    short = {name: value.item() for name, value in found.params.items() if value.numel() == 1}
+    if short:
+        _log.info("found %s", ", ".join(f"{name}={value:.3g}" for name, value in short.items()))
+    return found.identity, None
 
 
 def _cameras(options: FitOptions) -> tuple[Camera, ...]:
@@ -159,21 +208,6 @@ def _unit_error(path: Path, error: InputError, metres: float) -> InputError:
         f"{path.name}: unit", got=f"{error.got}, in units of {metres:g} m", expected="a person",
         fix="Pass unit=m, cm or mm as the points are stored, or backend.params of a body of that size.",
     )  # fmt: skip
-
-
-def _motion(
-    path: Path, layer: SomaLayer, result: PointResult, lengths: torch.Tensor | None, fps: float
-) -> Motion:
-    bones = layer.animation.bone_vectors(layer.identity(), lengths)[0, 1:].cpu().numpy()
-    return Motion(
-        rotations=result.rotations.cpu().numpy(),
-        translation=result.translation.cpu().numpy(),
-        fps=fps,
-        joint_names=layer.joint_names,
-        rig_revision=layer.rig.revision,
-        source=str(path),
-        skeleton=bones,
-    )
 
 
 def _doubts(result: PointResult, lengths: torch.Tensor | None, extent: float | None) -> list[str]:

@@ -13,7 +13,15 @@ from soma_core import SomaLayer
 from soma_core.errors import InputError
 from soma_core.io.camera import read_cameras
 from soma_core.io.motion_files import read_motion
-from soma_core.motion import ConvertOptions, InvertOptions, convert_file, invert, load_clip
+from soma_core.motion import (
+    BackendChoice,
+    ConvertOptions,
+    IdentityChoice,
+    InvertOptions,
+    convert_file,
+    invert,
+    load_clip,
+)
 
 LAYER = SomaLayer("soma", lod="low")
 CLIP = load_clip().cut(slice(0, 24))
@@ -114,3 +122,27 @@ def test_pictures_become_a_motion(tmp_path: Path) -> None:
 def test_a_camera_without_points_is_refused() -> None:
     with pytest.raises(InputError, match="points=NAME"):
         InvertOptions(camera="camera.json")
+
+
+def test_an_unknown_body_is_found_and_kept(tmp_path: Path) -> None:
+    layer = SomaLayer("toy", lod="low")
+    body = {"size": 0.8, "legs": 1.1}
+    points = LAYER.points(
+        layer.joints(
+            layer.identity(body), torch.as_tensor(CLIP.rotations), torch.as_tensor(CLIP.translation)
+        ),
+        "smpl22",
+    ).numpy()
+    np.save(tmp_path / "points.npy", points)
+    options = {"points": "smpl22", "fps": 30, "lod": "low", "backend": BackendChoice(name="toy")}
+    choice = IdentityChoice(method="backend", free=["size", "legs"])
+    given = ConvertOptions(identity=choice, **options)
+    found = convert_file(tmp_path / "points.npy", tmp_path / "out", options=given)
+    kept = found.report["identity"]
+    assert kept["backend"] == "toy"
+    assert kept["params"]["size"] == pytest.approx(0.8, abs=0.01)
+    assert kept["params"]["legs"] == pytest.approx(1.1, abs=0.02)
+    assert read_motion(found.files.motion).identity["params"] == kept["params"]
+    given = ConvertOptions(identity=IdentityChoice(method="unpose"), **options)
+    with pytest.raises(InputError, match="unpose of points"):
+        convert_file(tmp_path / "points.npy", tmp_path / "out2", options=given)
