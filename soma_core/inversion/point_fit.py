@@ -19,7 +19,7 @@ from soma_core.inversion.problem import Pose, part_of
 from soma_core.inversion.result import InversionResult
 from soma_core.skeleton.identity import Identity
 
-__all__ = ["FEWEST", "HIPS_PACE", "PointFit", "PointResult", "bridged", "determined"]
+__all__ = ["FEWEST", "HIPS_PACE", "PointFit", "PointResult", "bridged", "determined", "trusted"]
 
 _CHUNK = 2048
 """Frames fitted at a time."""
@@ -35,6 +35,13 @@ _SAMPLED, _COUNTED = 128, 8
 
 _LEAST_CLAIM = 5e-4
 """No angle is claimed to be surer than so much noise of a coordinate would let it be [m]."""
+
+_OUTLYING, _ROUNDS, _SETTLED = 6.0, 5, 0.1
+"""Points that miss by more than so many times the noise are none of the body: their weight falls with the
+fourth power of their distance, in so many rounds, until no weight changes by more."""
+
+_MEDIAN = 0.6745
+"""Median of the absolute values of normal noise."""
 
 _STILL = 0.02
 """A frame rests when a step changes the root mean square error by less than this share of the noise."""
@@ -113,7 +120,7 @@ class PointFit:
         self.weights, self.rest = weights, model.rest(identity, bone_scale)
         self.given, self.iterations = noise, iterations
         self.every = every = weights.expand(len(points), -1)
-        self.valid = (every > 0).sum(1) >= FEWEST
+        self.sure, self.valid = every, (every > 0).sum(1) >= FEWEST
         total = every.sum(1, keepdim=True).clamp_min(1e-12)
         self.origin = (every[..., None] * points).sum(1) / total
         self.points = (points - self.origin[:, None]) * (every > 0)[..., None]
@@ -158,7 +165,10 @@ class PointFit:
             self._correct()
         if self.model.corrected and self.given is None:
             self.noise = self._estimate()
-        self._solve(max(self.noise, _FIRST_NOISE))
+        for _ in range(_ROUNDS):
+            self._solve(max(self.noise, _FIRST_NOISE))
+            if not self._trusted():
+                break
         if self.noise < _FIRST_NOISE:
             self._solve(_FIRST_NOISE, held=True)
 
@@ -169,10 +179,15 @@ class PointFit:
             return
         targets = self.points - self.shift + self.origin[:, None]
         pace = torch.cat((model.pace[model.solver.variables], model.pace.new_tensor([HIPS_PACE])))
-        rows = rows_of(targets, self.weights, max(self.noise, _FIRST_NOISE))
-        solve = PointRows(model, self.rest, rows, smooth=pace / fps**2)
-        found = solve(bridged(replace(pose, translation=pose.translation + self.origin), self.valid))
-        self.pose = replace(found, translation=found.translation - self.origin)
+        found = bridged(replace(pose, translation=pose.translation + self.origin), self.valid)
+        for _ in range(_ROUNDS):
+            rows = rows_of(targets, self.weights, max(self.noise, _FIRST_NOISE))
+            found = PointRows(model, self.rest, rows, smooth=pace / fps**2)(found)
+            self.pose = replace(found, translation=found.translation - self.origin)
+            if not self._trusted():
+                break
+        if self.given is None and not torch.equal(self.every, self.sure):
+            self.noise = self._sampled()._estimate()
         self.bridged = self.bridged | bool(self.valid.any())
 
     def _sampled(self) -> PointFit:
@@ -180,7 +195,7 @@ class PointFit:
         some = torch.nonzero(self.valid).flatten()
         some = some[torch.linspace(0, len(some) - 1, min(len(some), _SAMPLED)).round().long()]
         twin = copy.copy(self)
-        for name in ("weights", "every", "valid", "origin", "points", "shift"):
+        for name in ("weights", "every", "sure", "valid", "origin", "points", "shift"):
             value = getattr(self, name)
             setattr(twin, name, value if len(value) == 1 < len(self.valid) else value[some])
         twin.rest, twin.pose = self._rest_of(some), self.pose.part(some)
@@ -202,6 +217,30 @@ class PointFit:
             solver, steps = self.model.solver, self.iterations
             done.append(solver(target, moments, one.pose, iterations=steps, tolerance=still))
         self.pose = Pose(**{name: torch.cat([vars(one)[name] for one in done]) for name in vars(self.pose)})
+
+    def _trusted(self) -> bool:
+        """Let points count less that miss by more than noise does; whether that changed anything."""
+        misses = torch.cat([self._misses(one).norm(dim=-1) for one in self.chunks()])
+        own = trusted(misses * self.sure.sqrt(), max(self.noise, _FIRST_NOISE))
+        weights = self.sure * own
+        same = torch.allclose(weights, self.every, atol=_SETTLED)
+        if not same:
+            self.weights, self.every = weights, weights
+            if self.given is None:
+                self.noise = min(self.noise, self._typical())
+        return not same
+
+    def _typical(self) -> float:
+        """Noise of a coordinate [m], by the median of what is left at points of the body."""
+        misses = torch.cat([self._misses(one) for one in self.chunks()]) * self.every.sqrt()[..., None]
+        there = (self.every > 0.5 * self.sure) & (self.sure > 0) & self.valid[:, None]
+        if not bool(there.any()):
+            return self.noise
+        some = torch.nonzero(self.valid).flatten()
+        some = some[:: max(1, len(some) // _COUNTED)]
+        seen = 3.0 * float(there[some].sum(1).float().mean())
+        spare = max(seen - float(self._taken(some)), 0.1 * seen)
+        return max(float(misses[there].abs().median()) / _MEDIAN * (seen / spare) ** 0.5, _LEAST_NOISE)
 
     def _misses(self, one: _Chunk) -> Tensor:
         """What points of a chunk miss, (f, P, 3) [m]."""
@@ -283,6 +322,11 @@ class PointFit:
             noise=self.noise,
             plain=torch.zeros_like(valid),
         )
+
+
+def trusted(misses: Tensor, noise: float) -> Tensor:
+    """Shares of the weights of points that miss by so much: one but for those that are none of the body."""
+    return (_OUTLYING * noise / misses.clamp_min(1e-12)).clamp_max(1.0) ** 4
 
 
 def determined(std: Tensor, model: PointModel) -> Tensor:

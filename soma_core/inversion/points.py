@@ -135,26 +135,39 @@ class PointInversion(Derived):
                     self.model, self.start, views, identity, scale, noise=noise or self.noise, fps=fps
                 )(initial)  # fmt: skip
         points = self._checked(points)
-        count = len(points)
-        weights = check_weights(weights, points.new_ones(points.shape[1]), count)
-        bone_scale = check_bone_scale(bone_scale, count, len(layer.joint_names), layer.dtype, layer.device)
-        with torch.no_grad():
-            known = torch.isfinite(points).all(-1)
-            if not bool(known.all()):
-                weights = weights * known
-            clean = torch.where(known[..., None], points, 0.0)
-            fit = PointFit(
-                self.model, self.start, clean, weights, identity, bone_scale, noise=noise or self.noise,
-                iterations=self.iterations,
-            )  # fmt: skip
-            fit.begin(initial)
-            fit.run()
-            if fps is not None:
-                fit.smooth(fps)
-            return fit.result(known)
+        return self._of_places(points, identity, weights, bone_scale, initial, fps, noise or self.noise)
 
     if TYPE_CHECKING:  # torch says that a module returns anything
         __call__ = forward
+
+    @torch.no_grad()
+    def _of_places(
+        self,
+        points: Tensor,
+        identity: Identity,
+        weights: Tensor | None,
+        bone_scale: Tensor | None,
+        initial: InversionResult | None,
+        fps: float | None,
+        noise: float | None,
+    ) -> PointResult:
+        """:meth:`forward` of points in space."""
+        layer, count = self.layer, len(points)
+        weights = check_weights(weights, points.new_ones(points.shape[1]), count)
+        bone_scale = check_bone_scale(bone_scale, count, len(layer.joint_names), layer.dtype, layer.device)
+        known = torch.isfinite(points).all(-1)
+        if not bool(known.all()):
+            weights = weights * known
+        clean = torch.where(known[..., None], points, 0.0)
+        fit = PointFit(
+            self.model, self.start, clean, weights, identity, bone_scale, noise=noise,
+            iterations=self.iterations,
+        )  # fmt: skip
+        fit.begin(initial)
+        fit.run()
+        if fps is not None:
+            fit.smooth(fps)
+        return fit.result(known)
 
     def _views(self, pixels: Tensor, cameras: Sequence[Camera], weights: Tensor | None) -> Views:
         """Points in pictures, checked."""

@@ -9,7 +9,15 @@ import torch
 from torch import Tensor
 
 from soma_core.geometry.rotations import axis_angle_to_matrix
-from soma_core.inversion.point_fit import FEWEST, HIPS_PACE, PointFit, PointResult, bridged, determined
+from soma_core.inversion.point_fit import (
+    FEWEST,
+    HIPS_PACE,
+    PointFit,
+    PointResult,
+    bridged,
+    determined,
+    trusted,
+)
 from soma_core.inversion.point_model import PointModel, PointRest
 from soma_core.inversion.point_rows import PointRows
 from soma_core.inversion.point_start import PointStart
@@ -29,8 +37,9 @@ _CLOSEST = 0.5
 _SPEED, _WAVER, _LEAP = 3.0, 0.2, 4.0
 """Between frames a joint turns about so fast [rad/s] and so far [rad]; more costs no more than this."""
 
-_CORRECTIONS = 2
-"""How often what twist joints and correctives do to points of the skin is looked at."""
+_CORRECTIONS, _ROUNDS, _SETTLED = 2, 6, 0.1
+"""How often a motion is fitted until the weights of points that are none of the body change by no more; how
+often what twist joints and correctives do to points of the skin is looked at."""
 
 _TOLD = 0.25
 """Share of the numbers that a pose must leave over, so that what it misses tells their noise."""
@@ -63,7 +72,7 @@ class ViewFit:
         self.identity, self.bone_scale = identity, bone_scale
         self.rest = model.rest(identity, bone_scale)
         self.valid = ((views.weights > 0).sum(2) >= FEWEST).any(0)
-        self.given = noise
+        self.given, self.sure = noise, views.weights
         self.noise = noise or views.noise(motion=fps is not None)
         self.shift = views.rays.new_zeros(*views.rays.shape[1:3], 3)
         self.pose = Pose.begin(model.mean.expand(len(self.shift), -1, 3, 3), self.shift[:, 0])
@@ -91,12 +100,22 @@ class ViewFit:
         """Fit all frames, and look at the noise and at what twist joints and correctives do."""
         if not bool(self.valid.any()):
             return
-        self._solve()
-        if self.given is None:
-            self.noise = self._estimate()
-        for _ in range(_CORRECTIONS if self.model.corrected else 0):
-            self._correct()
+        for number in range(_ROUNDS):
             self._solve()
+            if self.given is None:
+                self.noise = self._estimate()
+            if number < _CORRECTIONS and self.model.corrected:
+                self._correct()
+            elif not self._trusted() and number:
+                break
+
+    def _trusted(self) -> bool:
+        """Let points count less that miss by more than noise does; whether that changed anything."""
+        misses = self.views.seen(self._points())[0].norm(dim=-1)
+        weights = self.sure * trusted(misses * self.sure.sqrt(), self.noise)
+        same = torch.allclose(weights, self.views.weights, atol=_SETTLED)
+        self.views = replace(self.views, weights=weights)
+        return not same
 
     def _rest_of(self, some: Tensor) -> PointRest:
         rest = self.rest
@@ -202,8 +221,9 @@ class ViewFit:
         if spare < _TOLD * count:
             return self.noise
         misses = views.weights * views.seen(self._points())[0].square().sum(-1)
-        energy = float(misses.sum((0, 2))[self.valid].mean())
-        return max(math.sqrt(energy / spare), views.least_noise)
+        energy = float(misses.sum((0, 2))[self.valid].median())
+        usual = (1 - 2 / (9 * spare)) ** 3  # the median of chi squared beside its mean
+        return max(math.sqrt(energy / (usual * spare)), views.least_noise)
 
     def _correct(self) -> None:
         """What twist joints and correctives do to the points, beside plain skinning."""

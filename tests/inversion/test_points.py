@@ -236,3 +236,22 @@ def test_cameras_in_millimetres_are_told() -> None:
     far = [replace(c, extrinsics=c.extrinsics * [1, 1, 1, 1000]) for c in cameras]
     with pytest.raises(InputError, match=r"translations of the cameras by 0\.001"):
         PointInversion(LAYER, "coco17")(_seen(points, *cameras), IDENTITY, cameras=far, fps=fps)
+
+
+def test_points_that_are_none_of_the_body_are_left_out() -> None:
+    points, fps = _walk()
+    seen, random = points.clone(), torch.Generator().manual_seed(3)
+    wrong = torch.rand(seen.shape[:2], generator=random) < 0.04
+    seen[wrong] += 0.4 * torch.randn(int(wrong.sum()), 3, generator=random)
+    inversion = PointInversion(LAYER, "coco17")
+    result = inversion(seen, IDENTITY, fps=fps)
+    again = LAYER.points(LAYER.pose(IDENTITY, result.rotations, result.translation), "coco17")
+    missed = (again - points).norm(dim=-1)
+    assert missed.mean() < 0.005
+    assert missed[wrong].mean() < 0.03  # between frames before and after [m]
+    cameras = _camera(0.0), _camera(1.5)
+    pixels = _seen(points, *cameras)
+    pixels[0, 7, 9], pixels[1, 12, 3] = pixels[0, 7, 9] + 200, pixels[1, 12, 3] - 150
+    result = inversion(pixels, IDENTITY, cameras=cameras, fps=fps)
+    again = LAYER.points(LAYER.pose(IDENTITY, result.rotations, result.translation), "coco17")
+    assert (again - points).norm(dim=-1).max() < 0.02
