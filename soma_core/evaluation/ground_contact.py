@@ -21,7 +21,7 @@ from soma_core.motion.conversion import load_clip
 from soma_core.motion.ground import leg_length, rest_offsets
 from soma_core.skeleton.identity import Identity
 
-__all__ = ["recorded_joints", "run", "slide_of"]
+__all__ = ["motion_files", "recorded_joints", "run", "slide_of"]
 
 _AGES = {"infant": 0.0, "adult": 2 / 3, "elder": 1.0}
 _NATIVE = "native"
@@ -72,7 +72,7 @@ def recorded_joints(motion: Motion, offsets: np.ndarray) -> np.ndarray:
     return np.stack([placed(USER_JOINTS.index(name))[1] for name in CONTACT_JOINTS], axis=1)
 
 
-def _files(data: str | None) -> list[Path]:
+def motion_files(data: str | None) -> list[Path]:
     """Motion files of a setting; none where there is neither that nor the folder of the environment."""
     usual = Path(os.environ.get(_VARIABLE, "")) / "motions"
     if data is None:
@@ -142,7 +142,7 @@ def run(config: DictConfig) -> Report:
         SomaError: a motion or the backend cannot be used.
     """
     native = SomaLayer("soma", device=config.device)
-    clips = list(_clips(_files(config.experiment.data), native))
+    clips = list(_clips(motion_files(config.experiment.data), native))
     rows: list[list[str | float]] = []
     figures: list[Figure] = []
     for name, layer, identity in _bodies(config.experiment.backend, native, config.device):

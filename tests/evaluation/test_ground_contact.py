@@ -47,6 +47,6 @@ def test_a_short_clip_on_the_native_body(tmp_path, monkeypatch):
     empty = tmp_path / "none"
     empty.mkdir()
     monkeypatch.setenv("SOMA_TEST_DATA", str(empty))
-    assert ground_contact._files(None) == []
+    assert ground_contact.motion_files(None) == []
     with pytest.raises(AssetError, match="no motion files"):
         ground_contact.run(config(str(empty)))
