@@ -1,6 +1,6 @@
 """Pose from 22 joints against Adam on the same joints: errors first, then alternating rounds.
 
-``python benchmarks/points.py`` prints the table of benchmarks/README.md. The peer is what fits of SMPL's joints
+``python benchmarks/points.py`` prints the table of the README. The peer is what fits of SMPL's joints
 usually are: forward kinematics of the rotations of 22 joints as axis-angles, the mean squared distance, and
 Adam from the rest pose, as short as it can be written, with no prior and no check.
 """
@@ -107,8 +107,8 @@ def main() -> None:
         used, passed = (statistics.median(one[k] for one in spent[name]) for k in (0, 1))
         share = "1x" if name == "ours" else f"{ratio:.3g}x"
         lines.append(
-            f"| {name} | {float(error.mean()):.3g} | {float(error.max()):.3g} | {options.frames / used:,.0f} | "
-            f"{options.frames / passed:,.0f} | {share} |"
+            f"| {name} | {float(error.mean()):.3g} | {float(error.max()):.3g} | "
+            f"{options.frames / used:,.0f} | {options.frames / passed:,.0f} | {share} |"
         )
     threads = f"{options.threads} thread" + ("s" if options.threads > 1 else "")
     adams = f"Adam: {options.steps} steps, rate {options.rate}"

@@ -19,7 +19,7 @@ from soma_core.inversion.problem import Pose, part_of
 from soma_core.inversion.result import InversionResult
 from soma_core.skeleton.identity import Identity
 
-__all__ = ["FEWEST", "HIPS_PACE", "PointFit", "PointResult", "bridged", "determined", "trusted"]
+__all__ = ["FEWEST", "PointFit", "PointResult", "bridged", "determined", "paces", "trusted"]
 
 _CHUNK = 2048
 """Frames fitted at a time."""
@@ -46,7 +46,7 @@ _MEDIAN = 0.6745
 _STILL = 0.02
 """A frame rests when a step changes the root mean square error by less than this share of the noise."""
 
-HIPS_PACE = 5.0
+_HIPS_PACE = 5.0
 """Usual acceleration of the Hips [m/s^2]."""
 
 _ROUNDING = 1e-6
@@ -178,17 +178,22 @@ class PointFit:
         if len(pose.translation) < 3:
             return
         targets = self.points - self.shift + self.origin[:, None]
-        pace = torch.cat((model.pace[model.solver.variables], model.pace.new_tensor([HIPS_PACE])))
         found = bridged(replace(pose, translation=pose.translation + self.origin), self.valid)
         for _ in range(_ROUNDS):
             rows = rows_of(targets, self.weights, max(self.noise, _FIRST_NOISE))
-            found = PointRows(model, self.rest, rows, smooth=pace / fps**2)(found)
+            found = PointRows(model, self.rest, rows, smooth=paces(model, fps))(found)
             self.pose = replace(found, translation=found.translation - self.origin)
             if not self._trusted():
                 break
         if self.given is None and not torch.equal(self.every, self.sure):
             self.noise = self._sampled()._estimate()
         self.bridged = self.bridged | bool(self.valid.any())
+
+    def lowered(self, points: Tensor, fps: float | None) -> PointRows:
+        """What the fit lowers, of points (F, P, 3) [m] in the world, with the weights that it came to."""
+        rows = rows_of(points - self.shift, self.weights, max(self.noise, _FIRST_NOISE))
+        smooth = None if fps is None or len(points) < 3 else paces(self.model, fps)
+        return PointRows(self.model, self.rest, rows, smooth=smooth)
 
     def _sampled(self) -> PointFit:
         """A fit of some of the frames, evenly spaced, in which points have their way."""
@@ -322,6 +327,12 @@ class PointFit:
             noise=self.noise,
             plain=torch.zeros_like(valid),
         )
+
+
+def paces(model: PointModel, fps: float) -> Tensor:
+    """Usual second differences (n + 1,) of the variables' turns [rad] and of the Hips [m]."""
+    pace = torch.cat((model.pace[model.solver.variables], model.pace.new_tensor([_HIPS_PACE])))
+    return pace / fps**2
 
 
 def trusted(misses: Tensor, noise: float) -> Tensor:

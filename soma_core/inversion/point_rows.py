@@ -87,7 +87,7 @@ class PointRows:
         energy, system = self._system(pose, part)
         damping = torch.full_like(energy, 1e-4)
         for _ in range(_STEPS):
-            trial = self._moved(pose, self._step(system, damping))
+            trial = self.moved(pose, self._step(system, damping))
             new, made = self._system(trial, part)
             better = new < energy
             gain = ((energy - new) / energy.clamp_min(1e-12)).max()
@@ -141,7 +141,17 @@ class PointRows:
             last_change=pose.last_change,
         )
 
-    def _moved(self, pose: Pose, step: Tensor) -> Pose:
+    def energy_near(self, pose: Pose, step: Tensor) -> Tensor:
+        """What is minimised, of all frames, as a differentiable function of small turns and shifts (F, d)."""
+        moved, whole = self.moved(pose, step), slice(0, len(pose.translation))
+        turns, places = self.model.solver.walk_public(moved, self.rest.offsets)
+        residual, _ = self.rows(self.model.points(self.rest, turns, places), whole)
+        matrix = torch.zeros(len(step), self.size, self.size).to(step)
+        energy = residual.square().sum() + self._expected(moved, matrix, torch.zeros_like(step)).sum()
+        return energy if self.smooth is None else energy + self._accelerations(moved)[0]
+
+    def moved(self, pose: Pose, step: Tensor) -> Pose:
+        """The pose after small turns in the axes of the parents, and shifts (F, d)."""
         turns = axis_angle_to_matrix(step[:, :-3].unflatten(1, (-1, 3)).clamp(-1, 1))
         relative = pose.relative.clone()
         relative[:, self.variables] = turns @ pose.relative[:, self.variables]
@@ -222,10 +232,12 @@ class PointRows:
         change = speed[1:] - speed[:-1]
         weight = self._stiffness()
         pull = change * weight
+        by_speed = torch.zeros_like(speed)
+        by_speed[1:] += pull
+        by_speed[:-1] -= pull
         slope = pull.new_zeros(len(pose.translation), self.size)
-        slope[:-2] += pull
-        slope[1:-1] -= 2 * pull
-        slope[2:] += pull
+        slope[1:] += _carried(speed, by_speed, 0.5)
+        slope[:-1] -= _carried(speed, by_speed, -0.5)
         return (change * pull).sum(), slope
 
     def _stiffness(self) -> Tensor:
@@ -234,19 +246,22 @@ class PointRows:
 
     def _step(self, system: tuple[Tensor, Tensor], damping: Tensor) -> Tensor:
         """Damped step (F, d)."""
-        matrix, slope = system
+        return -self.solved(*system, damping)
+
+    def solved(self, matrix: Tensor, slope: Tensor, damping: Tensor, *, double: float = 1.0) -> Tensor:
+        """Motions (F, d) that the damped matrix maps to slopes; what ties frames counts `double` times."""
         diagonal = matrix.diagonal(dim1=-2, dim2=-1)
         extra = damping[:, None] * diagonal + 1e-9 * diagonal.mean(1, keepdim=True)
         matrix = matrix + torch.diag_embed(extra)
         if self.smooth is None or len(matrix) < 3:
             factor, _ = torch.linalg.cholesky_ex(matrix.double())
-            return -torch.cholesky_solve(slope.double()[..., None], factor).squeeze(-1).to(slope)
-        return -self._banded(matrix.double().numpy(), slope.double().numpy()).to(slope)
+            return torch.cholesky_solve(slope.double()[..., None], factor).squeeze(-1).to(slope)
+        return self._banded(matrix.double().numpy(), slope.double().numpy(), double).to(slope)
 
-    def _banded(self, matrix: np.ndarray, slope: np.ndarray) -> Tensor:
+    def _banded(self, matrix: np.ndarray, slope: np.ndarray, double: float) -> Tensor:
         """Solution of all frames together, whose second differences are held."""
         frames, size = slope.shape
-        weight = self._stiffness().double().numpy()
+        weight = double * self._stiffness().double().numpy()
         second = np.zeros((frames, 3))  # products of second differences: own, next, after next
         second[: frames - 2, 0] += 1
         second[1 : frames - 1, 0] += 4
@@ -269,3 +284,15 @@ class PointRows:
                 check_finite=False,
             ).reshape(frames, size)
         )
+
+
+def _carried(speed: Tensor, slope: Tensor, half: float) -> Tensor:
+    """Slopes (F, d) by differences of turns, as slopes by small turns after (0.5) or before (-0.5) them.
+
+    The inverse right or left Jacobian of the rotation group, to the second order: nobody turns by more than
+    half a radian between frames.
+    """
+    turn, torque = (one[:, :-3].unflatten(1, (-1, 3)) for one in (speed, slope))
+    once = torch.linalg.cross(turn, torque, dim=-1)
+    twice = torch.linalg.cross(turn, once, dim=-1)
+    return torch.cat(((torque + half * once + twice / 12).flatten(1), slope[:, -3:]), 1)

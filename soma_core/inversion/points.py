@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -14,8 +15,10 @@ from soma_core._inputs import check_bone_scale, check_choice
 from soma_core.errors import InputError
 from soma_core.inversion._inputs import check_weights, refuse_transforms
 from soma_core.inversion.point_fit import PointFit, PointResult
+from soma_core.inversion.point_gradient import attach_point_gradient
 from soma_core.inversion.point_model import PointModel
 from soma_core.inversion.point_priors import JointPrior
+from soma_core.inversion.point_rows import PointRows
 from soma_core.inversion.point_start import PointStart
 from soma_core.inversion.point_views import Views
 from soma_core.inversion.result import InversionResult
@@ -127,13 +130,16 @@ class PointInversion(Derived):
             self._build(layer.device, layer.dtype)
         layer.check_identity(identity)
         if cameras is not None:
-            views = self._views(points, (cameras,) if isinstance(cameras, Camera) else cameras, weights)
+            given = (cameras,) if isinstance(cameras, Camera) else tuple(cameras)
+            views = self._views(points, given, weights)
             count, joints = views.weights.shape[1], len(layer.joint_names)
             scale = check_bone_scale(bone_scale, count, joints, layer.dtype, layer.device)
+            fit = ViewFit(
+                self.model, self.start, views, identity, scale, noise=noise or self.noise, fps=fps
+            )  # fmt: skip
             with torch.no_grad():
-                return ViewFit(
-                    self.model, self.start, views, identity, scale, noise=noise or self.noise, fps=fps
-                )(initial)  # fmt: skip
+                result = fit(initial)
+            return self._tracked(result, points, lambda seen: fit.lowered(self._views(seen, given, weights)))
         points = self._checked(points)
         return self._of_places(points, identity, weights, bone_scale, initial, fps, noise or self.noise)
 
@@ -167,7 +173,21 @@ class PointInversion(Derived):
         fit.run()
         if fps is not None:
             fit.smooth(fps)
-        return fit.result(known)
+        return self._tracked(fit.result(known), points, lambda clean: fit.lowered(clean, fps))
+
+    def _tracked(
+        self, result: PointResult, points: Tensor, rows: Callable[[Tensor], PointRows]
+    ) -> PointResult:
+        """A result whose pose carries the gradient of its points."""
+        if not points.requires_grad:
+            return result
+        known = torch.isfinite(points)
+        with torch.enable_grad():
+            clean = torch.where(known, points, 0.0)
+            rotations, translation = attach_point_gradient(
+                clean, result.rotations, result.translation, rows=rows
+            )
+        return replace(result, rotations=rotations, translation=translation)
 
     def _views(self, pixels: Tensor, cameras: Sequence[Camera], weights: Tensor | None) -> Views:
         """Points in pictures, checked."""

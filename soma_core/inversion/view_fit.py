@@ -11,11 +11,11 @@ from torch import Tensor
 from soma_core.geometry.rotations import axis_angle_to_matrix
 from soma_core.inversion.point_fit import (
     FEWEST,
-    HIPS_PACE,
     PointFit,
     PointResult,
     bridged,
     determined,
+    paces,
     trusted,
 )
 from soma_core.inversion.point_model import PointModel, PointRest
@@ -200,11 +200,18 @@ class ViewFit:
         return torch.stack(way[::-1])
 
     def _solve(self) -> None:
-        model, smooth = self.model, None
-        if self.fps is not None and len(self.valid) > 2:
-            pace = torch.cat((model.pace[model.solver.variables], model.pace.new_tensor([HIPS_PACE])))
-            smooth = pace / self.fps**2
-        self.pose = self._rows(smooth)(self.pose)
+        self.pose = self._rows(self._paces())(self.pose)
+
+    def _paces(self) -> Tensor | None:
+        """Usual second differences of one motion; None for frames that are apart."""
+        if self.fps is None or len(self.valid) < 3:
+            return None
+        return paces(self.model, self.fps)
+
+    def lowered(self, views: Views) -> PointRows:
+        """What the fit lowers, of what is seen, with the weights that it came to."""
+        rows = replace(views, weights=self.views.weights).rows(self.noise, self.shift)
+        return PointRows(self.model, self.rest, rows, smooth=self._paces())
 
     def _rows(self, smooth: Tensor | None) -> PointRows:
         return PointRows(self.model, self.rest, self.views.rows(self.noise, self.shift), smooth=smooth)

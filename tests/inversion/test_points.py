@@ -13,6 +13,7 @@ from soma_core import SomaLayer
 from soma_core.errors import InputError
 from soma_core.evaluation.random_poses import random_axis_angles
 from soma_core.geometry.rotations import axis_angle_to_matrix
+from soma_core.inversion import point_fit, point_rows
 from soma_core.inversion.point_priors import JointPrior, JointRange
 from soma_core.inversion.points import PointInversion
 from soma_core.io.camera import Camera
@@ -255,3 +256,33 @@ def test_points_that_are_none_of_the_body_are_left_out() -> None:
     result = inversion(pixels, IDENTITY, cameras=cameras, fps=fps)
     again = LAYER.points(LAYER.pose(IDENTITY, result.rotations, result.translation), "coco17")
     assert (again - points).norm(dim=-1).max() < 0.02
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("fps", "views"), [(None, 0), (30.0, 0), (30.0, 2)])
+def test_gradients_are_those_of_the_fit(
+    monkeypatch: pytest.MonkeyPatch, fps: float | None, views: int
+) -> None:
+    for module, name, value in ((point_fit, "_STILL", 1e-9), (point_rows, "_RESTING", 1e-14)):
+        monkeypatch.setattr(module, name, value)
+    monkeypatch.setattr(point_rows, "_STEPS", 200)  # differences of fits need them at rest
+    layer = SomaLayer("soma", lod="low", dtype=torch.float64)
+    body, clip = layer.identity(), load_clip().cut(slice(300, 306))
+    turns, path = (torch.as_tensor(one).double() for one in (clip.rotations, clip.translation))
+    points = layer.points(layer.joints(body, turns, path), "smpl22")
+    points = points + 0.01 * randn(*points.shape)
+    cameras = [_camera(0.0), _camera(1.5)] if views else None
+    if cameras is not None:
+        points = _seen(points, *cameras).double()
+    inversion = PointInversion(layer, "smpl22", noise=3.0 if views else 0.01, iterations=100)
+    by = randn(6, 77, 3, 3, seed=1)
+
+    def told(given: Tensor) -> Tensor:
+        found = inversion(given, body, fps=fps, cameras=cameras)
+        return (found.rotations * by).sum() + found.translation.sum()
+
+    leaf, way = points.clone().requires_grad_(), randn(*points.shape, seed=2)
+    (slope,) = torch.autograd.grad(told(leaf), leaf)
+    step = 1e-1 if views else 1e-4  # px, m
+    measured = (told(points + step * way) - told(points - step * way)) / (2 * step)
+    torch.testing.assert_close((slope * way).sum(), measured, rtol=2e-3, atol=1e-3)
