@@ -51,6 +51,7 @@ def rest_error(layer, found, truth):
     return float((step - step.mean(0)).norm(dim=-1).mean() * 1e3)
 
 
+@pytest.mark.slow
 def test_parameters_of_our_own_bodies_are_found(layer, truth, vertices):
     found = fit_identity(layer, vertices)
     assert found.converged

@@ -75,6 +75,7 @@ def test_a_body_is_where_the_layer_has_it(session, clip):
     np.testing.assert_array_equal(shape.joints, posed.joints[0].numpy())
 
 
+@pytest.mark.slow
 def test_moving_bodies_have_some_of_the_vertices_of_still_ones():
     session = Session(ViewOptions())
     figure = session.add("soma")
