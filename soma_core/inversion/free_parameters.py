@@ -59,6 +59,7 @@ class FreeParameters:
             defaults.append(np.full(size, parameter.default))
             units.append(np.full(size, (high - low) / _UNITS_OF_RANGE))
             deviation = parameter.default == 0 and low == -high
+            low, high = parameter.limits or parameter.range
             bounded.append(np.full((size, 2), (-np.inf, np.inf) if deviation else (low, high)))
         self._default, self._unit = np.concatenate(defaults), np.concatenate(units)
         low, high = np.concatenate(bounded).T

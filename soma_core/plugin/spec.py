@@ -54,6 +54,8 @@ class Parameter:
             A shorter vector is padded with the default.
         default: value of every entry that the caller leaves out.
         range: useful range (low, high); sampling stays inside, values outside are allowed.
+        limits: values beyond which nothing changes, or nothing is defined, where these are wider than
+            `range`; None where they are not. What searches for a body goes as far.
         group: optional heading under which listings show it.
         description: one line for people.
     """
@@ -64,6 +66,7 @@ class Parameter:
     range: tuple[float, float] = (-3.0, 3.0)
     group: str = ""
     description: str = ""
+    limits: tuple[float, float] | None = None
 
 
 @dataclass(frozen=True, kw_only=True)

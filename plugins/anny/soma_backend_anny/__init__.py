@@ -36,7 +36,10 @@ _SECONDARY_PHENOTYPES = {
 
 def _parameters() -> tuple[Parameter, ...]:
     def phenotype(name: str, description: str, group: str = "") -> Parameter:
-        return Parameter(name=name, default=0.5, range=(0.0, 1.0), group=group, description=description)
+        limits = (-1 / 3, 1.0) if name == "age" else None  # newborns are no part of a random population
+        return Parameter(
+            name=name, default=0.5, range=(0.0, 1.0), limits=limits, group=group, description=description
+        )
 
     return (
         *(phenotype(name, text) for name, text in _PHENOTYPES.items()),
