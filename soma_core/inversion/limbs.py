@@ -28,7 +28,7 @@ from soma_core.inversion.priors import TwistDoubt
 from soma_core.inversion.problem import Pose, Problem, View
 from soma_core.rig.skeleton import Rig
 
-__all__ = ["LimbStart", "TwistShare"]
+__all__ = ["Limb", "LimbStart", "TwistShare"]
 
 _INNER = (0.2, 0.8)
 """Helpers whose share of the end's twist lies between these: their skin hardly blends with other bones."""
@@ -120,7 +120,7 @@ class LimbStart(torch.nn.Module):
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class _Limb:
+class Limb:
     """One limb whose twist can be shared in many ways.
 
     Attributes:
@@ -175,7 +175,7 @@ class TwistShare:
         names = (*rig.joint_names, *rig.procedural.joint_names)
         channel, row = driven.joint.tolist(), {int(joint): index for index, joint in enumerate(joints)}
         device = driven.mix.device
-        self.limbs: list[_Limb] = []
+        self.limbs: list[Limb] = []
         for segment in rig.procedural.definition.segments:
             own, end = names.index(segment.start), names.index(segment.end)
             helpers = np.array([names.index(name) for name in segment.helpers])
@@ -188,7 +188,7 @@ class TwistShare:
             index = {"helpers": helpers - rig.joint_count, "clouds": clouds, "pairs": both, "first": first,
                      "second": second}  # fmt: skip
             self.limbs.append(
-                _Limb(
+                Limb(
                     own=own, end=end, channels=(channel.index(own), channel.index(end)),
                     axis=driven.spin_axis[int(helpers[0]) - rig.joint_count],
                     **{name: torch.as_tensor(array, device=device) for name, array in index.items()},
@@ -232,17 +232,17 @@ class TwistShare:
             self.turn(relative, limb, _lowest(angle, energy))
         return replace(pose, relative=relative)
 
-    def free(self, held: Collection[int]) -> list[_Limb]:
+    def free(self, held: Collection[int]) -> list[Limb]:
         """Limbs neither of whose joints is held."""
         return [limb for limb in self.limbs if limb.own not in held and limb.end not in held]
 
-    def turn(self, relative: Tensor, limb: _Limb, angle: Tensor) -> None:
+    def turn(self, relative: Tensor, limb: Limb, angle: Tensor) -> None:
         """Turn a limb's bone about its axis by `angle` (F,), in place; the next joint's world turn stays."""
         turn = axis_angle_to_matrix(angle[:, None] * limb.axis)
         relative[:, limb.own] = relative[:, limb.own] @ turn
         relative[:, limb.end] = turn.mT @ relative[:, limb.end]
 
-    def _skin(self, limb: _Limb, angle: Tensor, view: View, rest: RestMoments) -> Tensor:
+    def _skin(self, limb: Limb, angle: Tensor, view: View, rest: RestMoments) -> Tensor:
         """Change (F, a) of the error by what the helpers do when the bone turns by each `angle` (a,).
 
         Helpers lie on the bone, so that each turns in place by one angle, and the error is a polynomial in
@@ -269,7 +269,7 @@ class TwistShare:
         return energy + jumping * (_DEAR**2 * rest.own[..., 3, 3].sum(1))[:, None]
 
     def _doubts(
-        self, limb: _Limb, angle: Tensor, relative: Tensor, doubt: TwistDoubt, variables: Tensor
+        self, limb: Limb, angle: Tensor, relative: Tensor, doubt: TwistDoubt, variables: Tensor
     ) -> Tensor:
         """Change (F, a) of the doubt of the next joint's twist."""
         which = torch.nonzero(variables[doubt.variable] == limb.end).flatten()
@@ -282,7 +282,7 @@ class TwistShare:
         share = one.share(turned).view(len(relative), len(angle) + 1)
         return share[:, :-1] - share[:, -1:]
 
-    def _twists(self, limb: _Limb, angle: Tensor, view: View, rest: RestMoments) -> tuple[Tensor, Tensor]:
+    def _twists(self, limb: Limb, angle: Tensor, view: View, rest: RestMoments) -> tuple[Tensor, Tensor]:
         """Twists (F, a, 2) of the bone and of the next one when the bone turns by each `angle` (a,).
 
         Beside them, how far each joint is from half a turn, as the cosine of half its angle.
@@ -309,7 +309,7 @@ class TwistShare:
             cosines.append(seen[..., 0])
         return torch.stack(twists, -1), torch.stack(cosines, -1)
 
-    def _moves(self, limb: _Limb, angle: Tensor, relative: Tensor, view: View, scale: Tensor) -> Tensor:
+    def _moves(self, limb: Limb, angle: Tensor, relative: Tensor, view: View, scale: Tensor) -> Tensor:
         """Change (F, a) of the error by what the offsets do."""
         assert view.activity is not None
         assert view.activity.before is not None

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
+from soma_core.inversion.limbs import Limb
 from soma_core.inversion.model import PoseModel
 from soma_core.inversion.priors import JointTerms
 from soma_core.inversion.problem import Pose, Problem
@@ -38,9 +40,10 @@ _DOUBTFUL = (1e-6, 8e-4)
 """A root mean square error [m] between these is more than rounding and less than noise: such a frame may rest
 in a fold of the correctives beside its minimum, and is tried from further limb twists."""
 
-_LOPSIDED = 0.1
-"""Median over root mean square error: 0.9 where noise is left, 0.19 to 0.47 on meshes of another rig, 0.04
-where limbs stopped in a wrong place."""
+_LOPSIDED, _FAINT = (0.05, 0.15), 1e-5
+"""Median over root mean square error, where that is below and above what is doubtful: 0.9 where noise is left,
+0.19 to 0.47 on meshes of another rig; 0.01 to 0.04, or to 0.14 above, where limbs stopped in a wrong place. Less
+than the root mean square error [m] after them says nothing: every fit of what the model posed ends there."""
 
 _OF_ONE_PIECE = 0.1
 """Least :func:`clumping` of what another rig's skin leaves: at least 0.4 on meshes of Anny's own rig, at most
@@ -50,8 +53,13 @@ _WRONG = 2.0
 """A vertex is wrong where its residual is this many times as long as one that begins to count linearly: four
 times the median, which noise hardly reaches."""
 
-_TRIED = ((0.2, -0.2), (0.45, -0.45))
-"""Those twists, against what was found [rad]: pairs, the second for what the first leaves in doubt."""
+_TRIED, _FAR = ((0.2, -0.2), (0.45, -0.45)), (0.8, -0.8, 1.6, -1.6, 2.4, -2.4, 3.1)
+"""Those twists, against what was found [rad]: pairs, the second for what the first leaves in doubt; then, of one
+limb after the other, for what lies on few of the vertices."""
+
+
+_THEIRS = 0.25
+"""Share of the error on the skin of a limb from which that limb may be what is wrong."""
 
 
 class _Clip(NamedTuple):
@@ -76,10 +84,13 @@ def lopsided(distances: Tensor, weights: Tensor, residual: Tensor) -> Tensor:
         weights: (1 or F, v).
         residual: root mean square error (F,) [m].
     """
-    large = residual > _DOUBTFUL[1]
+    large = residual > _FAINT
     if not bool(large.any()):
         return large
-    return large & (median_distance(distances, weights) < _LOPSIDED * residual)
+    below, above = (share * residual for share in _LOPSIDED)
+    return large & (
+        median_distance(distances, weights) < torch.where(residual > _DOUBTFUL[1], above, below)
+    )
 
 
 def of_another_rig(model: PoseModel, problem: Problem, result: InversionResult) -> Tensor:
@@ -150,6 +161,7 @@ class WholeFit:
             variables = coarse.solver.variables.tolist()
             ends = [variables.index(limb.end) for limb in coarse.share.limbs if limb.end in variables]
             self.ends = torch.tensor(ends, device=coarse.solver.variables.device)
+            self.skin = coarse.skin_of([(limb.own, limb.end) for limb in coarse.share.limbs])
 
     def __call__(self, targets: Targets, pose: Pose) -> tuple[Pose, Problem]:
         """The pose, its translation in the world, and the problem of the model.
@@ -277,28 +289,57 @@ class WholeFit:
         """Frames that may rest beside their minimum are tried from other limb twists."""
         share = self.coarse.share
         limbs = [] if share is None else share.free(self._held(problem))
-        if share is None or not limbs:
+        if not limbs:
             return pose
         mass = problem.weights.sum(1).expand(len(pose.accepted))
         _, energy = self.coarse.distances(problem, pose, energy_only=True)
         error = (energy / mass).sqrt()
         rows = torch.nonzero((error > _DOUBTFUL[0]) & (error < _DOUBTFUL[1])).flatten()
         for tried in _TRIED:
-            if not len(rows):
-                break
-            rows = problem.several(rows)
-            many = rows.repeat(len(tried))
-            part, old = problem.part(many), pose.part(many)
-            relative = old.relative.clone()
-            angle = relative.new_tensor(tried).repeat_interleave(len(rows))
-            for limb in limbs:
-                share.turn(relative, limb, angle)
-            trial, _ = self._descended(self.coarse, part, replace(old, relative=relative), None)
-            _, reached = self.coarse.distances(part, trial, energy_only=True)
-            least, which = reached.view(len(tried), -1).min(0)
-            better = least < 0.9 * energy[rows]
-            pose = pose.put(
-                rows[better], trial.part((which * len(rows) + torch.arange(len(rows)).to(which))[better])
-            )
-            rows = rows[(torch.minimum(least, energy[rows]) / mass[rows]).sqrt() > _DOUBTFUL[0]]
+            pose, energy = self._tried(problem, pose, energy, rows, [(limbs, angle) for angle in tried])
+            rows = rows[(energy[rows] / mass[rows]).sqrt() > _DOUBTFUL[0]]
+        for limb, stray in self._stray(problem, pose, limbs, (energy / mass).sqrt()):
+            far = [([limb], angle) for angle in _FAR]
+            pose, energy = self._tried(problem, pose, energy, stray, far)
         return pose
+
+    def _stray(
+        self, problem: Problem, pose: Pose, limbs: Sequence[Limb], error: Tensor
+    ) -> list[tuple[Limb, Tensor]]:
+        """Limbs, and frames whose error (F,) [m] lies on few vertices, many of them theirs."""
+        rows = torch.nonzero(error > _FAINT).flatten()
+        if not len(rows):
+            return []
+        rows = problem.several(rows)
+        part = problem.part(rows)
+        distances, _ = self.coarse.distances(part, pose.part(rows))
+        assert distances is not None
+        few = median_distance(distances, part.weights) < _LOPSIDED[1] * error[rows]
+        energy = torch.where(part.weights > 0, part.weights * distances.square(), 0.0)
+        theirs = energy @ self.skin > _THEIRS * energy.sum(1, keepdim=True)
+        assert self.coarse.share is not None
+        places = [self.coarse.share.limbs.index(limb) for limb in limbs]
+        return [(limb, rows[few & theirs[:, place]]) for limb, place in zip(limbs, places, strict=True)]
+
+    def _tried(
+        self, problem: Problem, pose: Pose, energy: Tensor, rows: Tensor,
+        starts: Sequence[tuple[Sequence[Limb], float]],
+    ) -> tuple[Pose, Tensor]:  # fmt: skip
+        """Poses and their energies (F,), some frames descended again from limbs turned by other angles."""
+        if not len(rows):
+            return pose, energy
+        assert self.coarse.share is not None
+        rows = problem.several(rows)
+        many = rows.repeat(len(starts))
+        part, old = problem.part(many), pose.part(many)
+        relative = old.relative.clone()
+        for number, (limbs, angle) in enumerate(starts):
+            own = relative[number * len(rows) : (number + 1) * len(rows)]
+            for limb in limbs:
+                self.coarse.share.turn(own, limb, own.new_full((len(rows),), angle))
+        trial, _ = self._descended(self.coarse, part, replace(old, relative=relative), None)
+        _, reached = self.coarse.distances(part, trial, energy_only=True)
+        least, which = reached.view(len(starts), -1).min(0)
+        better = least < 0.9 * energy[rows]
+        chosen = trial.part((which * len(rows) + torch.arange(len(rows)).to(which))[better])
+        return pose.put(rows[better], chosen), energy.index_copy(0, rows[better], least[better])
