@@ -58,8 +58,9 @@ _TRIED, _FAR = ((0.2, -0.2), (0.45, -0.45)), (0.8, -0.8, 1.6, -1.6, 2.4, -2.4, 3
 limb after the other, for what lies on few of the vertices."""
 
 
-_THEIRS = 0.25
-"""Share of the error on the skin of a limb from which that limb may be what is wrong."""
+_FEW, _THEIRS = 0.25, 0.25
+"""A limb may be what is wrong where median over root mean square error is less, and more of the error than this
+share lies on the limb's skin."""
 
 
 class _Clip(NamedTuple):
@@ -314,7 +315,7 @@ class WholeFit:
         part = problem.part(rows)
         distances, _ = self.coarse.distances(part, pose.part(rows))
         assert distances is not None
-        few = median_distance(distances, part.weights) < _LOPSIDED[1] * error[rows]
+        few = median_distance(distances, part.weights) < _FEW * error[rows]
         energy = torch.where(part.weights > 0, part.weights * distances.square(), 0.0)
         theirs = energy @ self.skin > _THEIRS * energy.sum(1, keepdim=True)
         assert self.coarse.share is not None
