@@ -75,9 +75,20 @@ def _parameter_problem(item: Parameter) -> str | None:
         return f"the range of parameter {item.name} is {item.range!r}, expected two finite numbers"
     if not item.range[0] < item.range[1]:
         return f"the range of parameter {item.name} is {item.range}, expected (low, high) with low < high"
+    if item.limits is not None and not _around(item.limits, item.range):
+        return (
+            f"the limits of parameter {item.name} are {item.limits!r}, expected two finite numbers around "
+            f"{item.range}"
+        )
     if not _is_finite(item.default):
         return f"the default of parameter {item.name} is {item.default!r}, expected a finite number"
     return None
+
+
+def _around(limits: object, inner: tuple[float, float]) -> bool:
+    if not (isinstance(limits, tuple) and len(limits) == 2 and all(map(_is_finite, limits))):
+        return False
+    return bool(limits[0] <= inner[0] and inner[1] <= limits[1])
 
 
 def _is_finite(value: object) -> bool:

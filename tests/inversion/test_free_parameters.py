@@ -76,6 +76,24 @@ def test_a_start_outside_the_range_is_brought_inside(layer):
     np.testing.assert_allclose(parameters.params(parameters.start[None])["size"], [1.5])
 
 
+def test_limits_are_wider_than_the_range_that_counts_as_six_units(tmp_path):
+    tall = Parameter(name="size", default=1.0, range=(0.6, 1.5), limits=(0.3, 1.5))
+    spec = tiny_spec(write_pair(tmp_path), params=(SHAPE, tall))
+    registry = Registry([FakeEntryPoint("tiny", DressedPlugin(spec))])
+    other = SomaLayer("tiny", dtype=torch.float64, canonical=tiny_canonical(), registry=registry)
+    parameters = FreeParameters(other, {"size": 0.2}, ["size"])
+    np.testing.assert_allclose(parameters.upper - parameters.lower, 6 * 1.2 / 0.9)
+    np.testing.assert_allclose(parameters.params(parameters.start[None])["size"], [0.3])
+
+
+def test_newborns_can_be_found():
+    """Anny's youngest are younger than a random population begins."""
+    pytest.importorskip("soma_backend_anny")
+    parameters = FreeParameters(SomaLayer("anny", lod="low"), {"age": -0.3}, ["age"])
+    np.testing.assert_allclose(parameters.params(parameters.lower[None])["age"], [-1 / 3], rtol=1e-6)
+    np.testing.assert_allclose(parameters.params(parameters.start[None])["age"], [-0.3], rtol=1e-6)
+
+
 def test_steps_lead_away_from_the_nearer_bound(layer):
     parameters = FreeParameters(layer, None, ["shape", "size"])
     near_top = np.r_[np.zeros(4), parameters.upper[4]]

@@ -40,6 +40,10 @@ def test_a_sound_declaration_has_no_problem() -> None:
         ({"params": ("a",)}, "params is ('a',)"),
         ({"params": (Parameter(name="a"), Parameter(name="a"))}, "declares a more than once"),
         ({"params": (Parameter(name="a b"),)}, "'a b' is no key"),
+        (
+            {"params": (Parameter(name="a", limits=(-1.0, 3.0)),)},
+            "the limits of parameter a are (-1.0, 3.0), expected two finite numbers around (-3.0, 3.0)",
+        ),
         ({"params": (Parameter(name="a", range=(1.0, 1.0)),)}, "range of parameter a is (1.0, 1.0)"),
         ({"params": (Parameter(name=3),)}, "the parameter name 3 is no key"),
         (
