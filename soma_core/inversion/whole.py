@@ -41,9 +41,9 @@ _DOUBTFUL = (1e-6, 8e-4)
 in a fold of the correctives beside its minimum, and is tried from further limb twists."""
 
 _LOPSIDED, _FAINT = (0.05, 0.15), 1e-5
-"""Median over root mean square error, where that is below and above what is doubtful: 0.9 where noise is left,
-0.19 to 0.47 on meshes of another rig; 0.01 to 0.04, or to 0.14 above, where limbs stopped in a wrong place. Less
-than the root mean square error [m] after them says nothing: every fit of what the model posed ends there."""
+"""Median over root mean square error that is too little, where that is below and above 0.8 mm: 0.9 where
+noise is left, 0.19 to 0.47 on meshes of another rig; 0.01 to 0.04, or to 0.14 above, where limbs stopped in a
+wrong place. Then the error [m] below which all is well: every fit of what the model posed ends there."""
 
 _OF_ONE_PIECE = 0.1
 """Least :func:`clumping` of what another rig's skin leaves: at least 0.4 on meshes of Anny's own rig, at most
@@ -54,13 +54,13 @@ _WRONG = 2.0
 times the median, which noise hardly reaches."""
 
 _TRIED, _FAR = ((0.2, -0.2), (0.45, -0.45)), (0.8, -0.8, 1.6, -1.6, 2.4, -2.4, 3.1)
-"""Those twists, against what was found [rad]: pairs, the second for what the first leaves in doubt; then, of one
-limb after the other, for what lies on few of the vertices."""
+"""Those twists, against what was found [rad]: pairs, the second for what the first leaves in doubt; then, of
+one limb after the other, for what lies on few of the vertices."""
 
 
 _FEW, _THEIRS = 0.25, 0.25
-"""A limb may be what is wrong where median over root mean square error is less, and more of the error than this
-share lies on the limb's skin."""
+"""A limb may be what is wrong where median over root mean square error is less, and more of the error than
+this share lies on the limb's skin."""
 
 
 class _Clip(NamedTuple):
@@ -89,9 +89,7 @@ def lopsided(distances: Tensor, weights: Tensor, residual: Tensor) -> Tensor:
     if not bool(large.any()):
         return large
     below, above = (share * residual for share in _LOPSIDED)
-    return large & (
-        median_distance(distances, weights) < torch.where(residual > _DOUBTFUL[1], above, below)
-    )
+    return large & (median_distance(distances, weights) < torch.where(residual > _DOUBTFUL[1], above, below))
 
 
 def of_another_rig(model: PoseModel, problem: Problem, result: InversionResult) -> Tensor:
