@@ -40,9 +40,9 @@ _DOUBTFUL = (1e-6, 8e-4)
 """A root mean square error [m] between these is more than rounding and less than noise: such a frame may rest
 in a fold of the correctives beside its minimum, and is tried from further limb twists."""
 
-_LOPSIDED, _FAINT = (0.05, 0.15), 1e-5
+_LOPSIDED, _FAINT = (0.1, 0.15), 1e-5
 """Median over root mean square error that is too little, where that is below and above 0.8 mm: 0.9 where
-noise is left, 0.19 to 0.47 on meshes of another rig; 0.01 to 0.04, or to 0.14 above, where limbs stopped in a
+noise is left, 0.19 to 0.47 on meshes of another rig; 0.01 to 0.08, or to 0.14 above, where limbs stopped in a
 wrong place. Then the error [m] below which all is well: every fit of what the model posed ends there."""
 
 _OF_ONE_PIECE = 0.1
@@ -58,9 +58,9 @@ _TRIED, _FAR = ((0.2, -0.2), (0.45, -0.45)), (0.8, -0.8, 1.6, -1.6, 2.4, -2.4, 3
 one limb after the other, for what lies on few of the vertices."""
 
 
-_FEW, _THEIRS = 0.25, 0.25
+_FEW, _THEIRS, _AGAIN = 0.25, 0.25, 2
 """A limb may be what is wrong where median over root mean square error is less, and more of the error than
-this share lies on the limb's skin."""
+this share lies on the limb's skin; how often that is looked at."""
 
 
 class _Clip(NamedTuple):
@@ -297,9 +297,10 @@ class WholeFit:
         for tried in _TRIED:
             pose, energy = self._tried(problem, pose, energy, rows, [(limbs, angle) for angle in tried])
             rows = rows[(energy[rows] / mass[rows]).sqrt() > _DOUBTFUL[0]]
-        for limb, stray in self._stray(problem, pose, limbs, (energy / mass).sqrt()):
-            far = [([limb], angle) for angle in _FAR]
-            pose, energy = self._tried(problem, pose, energy, stray, far)
+        for _ in range(_AGAIN):
+            for limb, stray in self._stray(problem, pose, limbs, (energy / mass).sqrt()):
+                far = [([limb], angle) for angle in _FAR]
+                pose, energy = self._tried(problem, pose, energy, stray, far)
         return pose
 
     def _stray(
