@@ -104,7 +104,7 @@ class Animation(torch.nn.Module):
             world, transforms = to_bind_pose(fitted, kinematics.tree, *constants)
             return transforms, world
         positions = kinematics.bind_positions(kinematics.local_offsets(fitted), fitted[:, 1, :3, 3])
-        rotations = kinematics.bind_rotation.expand(len(fitted), -1, 3, 3)
+        rotations = kinematics.bind_rotation.expand(fitted.shape[0], -1, 3, 3)
         return skinning_transforms(rotations, positions, fitted), to_homogeneous(rotations, positions)
 
     def bone_vectors(self, identity: Identity, bone_scale: Tensor | None = None) -> Tensor:
@@ -197,7 +197,7 @@ class Animation(torch.nn.Module):
         reference = transformed()
         if self.warp_skinning and not reference:
             return _skin_warp(self.posed_skinning, rest, transforms)
-        if len(rest) == 1 and not rest.requires_grad and not reference:
+        if rest.shape[0] == 1 and not rest.requires_grad and not reference:
             return self.posed_skinning.shared(rest[0], transforms)
         return self.posed_skinning(rest.permute(2, 1, 0), transforms, rows=True)
 

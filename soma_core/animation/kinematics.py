@@ -99,7 +99,7 @@ class Kinematics(torch.nn.Module):
             offsets: (B or 1, J, 3) from :meth:`local_offsets`.
             translation: (B, 3) Hips position [m]; replaces its offset.
         """
-        batch = len(relative)
+        batch = relative.shape[0]
         eye = torch.eye(3, dtype=relative.dtype, device=relative.device).expand(batch, 1, 3, 3)
         root, limbs = torch.zeros_like(translation)[:, None], offsets[:, 2:].expand(batch, -1, 3)
         turns = torch.cat((eye, relative), 1)
@@ -133,7 +133,8 @@ class Kinematics(torch.nn.Module):
         turns, places = [relative[:, :1]], [offsets[:, :1]]
         for index in range(len(self.level_sizes)):
             level, parent = getattr(self, f"level_{index}"), getattr(self, f"level_parent_{index}")
-            above = turns[-1][:, parent]
-            places.append(places[-1][:, parent] + (above @ offsets[:, level, :, None]).squeeze(-1))
-            turns.append(above @ relative[:, level])
-        return torch.cat(turns, 1)[:, self.restore], torch.cat(places, 1)[:, self.restore]
+            above = turns[-1].index_select(1, parent)
+            step = (above @ offsets.index_select(1, level)[..., None]).squeeze(-1)
+            places.append(places[-1].index_select(1, parent) + step)
+            turns.append(above @ relative.index_select(1, level))
+        return (torch.cat(parts, 1).index_select(1, self.restore) for parts in (turns, places))

@@ -210,5 +210,5 @@ class Twist(torch.nn.Module):
         (xx, xy, xz), (_, yy, _), (_, zy, _) = (row.unbind(-1) for row in entry)
         across = torch.sqrt((xx * xx + xy * xy).clamp_min(torch.finfo(xx.dtype).eps ** 2))
         angles = torch.stack((_safe_atan2(zy, yy), torch.atan2(xz, across), _safe_atan2(-xy, xx)), -1)
-        chosen = torch.take_along_dim(angles, self.euler_axis.expand(angles.shape[:-1])[..., None], -1)
+        chosen = angles.gather(-1, self.euler_axis.expand(angles.shape[:-1])[..., None])
         return self.euler_sign * chosen.squeeze(-1)

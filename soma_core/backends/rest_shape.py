@@ -113,7 +113,7 @@ class ComposedRestShape(torch.nn.Module):
         rows, many = coefficients, len(self.basis)
         if rows.device.type != "cpu":  # a body's numbers lie together, as the kernels that follow read them
             stacked = torch.addmm(self.template.flatten(), rows, self.basis.T).T
-        elif len(rows) == 1:  # of one column MKL makes pieces four times as fast as the whole
+        elif rows.shape[0] == 1:  # of one column MKL makes pieces four times as fast as the whole
             parts = next(count for count in _PIECES if many % count == 0)
             basis, column = self.basis.view(parts, -1, rows.shape[1]), rows.T.expand(parts, -1, 1)
             stacked = torch.baddbmm(self.template.view(parts, -1, 1), basis, column).view(many, 1)

@@ -87,7 +87,7 @@ class Correctives(torch.nn.Module):
     def offsets(self, features: Tensor) -> Tensor:
         """Offsets (B, v, 3) [m] of the canonical body from features (B, J, 6)."""
         moved = self.second(self.activations(features))
-        return moved.view(-1, 3, len(features)).permute(2, 0, 1)
+        return moved.view(-1, 3, features.shape[0]).permute(2, 0, 1)
 
 
 def skeleton_length(bind_world: Tensor, rig: Rig) -> Tensor:

@@ -85,7 +85,8 @@ def matrix_to_quaternion(matrix: Tensor) -> Tensor:
     )  # fmt: skip
     candidates = torch.stack(entries, -1).unflatten(-1, (4, 4))  # row k is 4 q_k (w, x, y, z)
     largest = torch.diagonal(candidates, dim1=-2, dim2=-1).argmax(-1)
-    quaternion = torch.take_along_dim(candidates, largest[..., None, None], -2).squeeze(-2)
+    row = largest[..., None, None].expand(*largest.shape, 1, 4)  # take_along_dim fixes the batch on export
+    quaternion = candidates.gather(-2, row).squeeze(-2)
     quaternion = quaternion / quaternion.norm(dim=-1, keepdim=True)
     return torch.where(quaternion[..., :1] < 0, -quaternion, quaternion)
 

@@ -75,7 +75,7 @@ class SkeletonFit(torch.nn.Module):
 
     def forward(self, vertices: Tensor) -> Tensor:
         """World transforms (B, J, 4, 4) [m] of the joints, from vertices (B, v, 3) [m]. Differentiable."""
-        batch = len(vertices)
+        batch = vertices.shape[0]
         flat = vertices.permute(1, 2, 0).reshape(vertices.shape[1], 3 * batch)
         moments = self.moments(flat).view(self.joint_count, 4, 3, batch)
         return self.from_moments(moments.permute(3, 0, 1, 2))

@@ -119,7 +119,7 @@ class RotationFit(torch.nn.Module):
             displacement = fit_displacements(joints, covariances, self.bind, self.pivots, self.child_table)
         else:
             displacement = self.displacements(joints, covariances, self.bones)
-        eye = torch.eye(3, dtype=joints.dtype, device=joints.device).expand(len(joints), 1, 3, 3)
+        eye = torch.eye(3, dtype=joints.dtype, device=joints.device).expand(joints.shape[0], 1, 3, 3)
         world = torch.cat((eye, displacement), 1)[:, self.source] @ self.bind_rotation
         return 1.5 * world - 0.5 * world @ (world.transpose(-1, -2) @ world)  # undo the products' rounding
 
@@ -140,13 +140,13 @@ class RotationFit(torch.nn.Module):
             bones: (J, 3), or (B or 1, J, 3).
         """
         initial = rotation_from_covariance(covariances[:, self.pivots])
-        bones = bones.expand(len(joints), -1, -1)
+        bones = bones.expand(joints.shape[0], -1, -1)
         first, target = self._bones(joints, initial, bones, self.single, self.single_child)
         aligned = shortest_arc(first, target) @ initial[:, self.single]
         rank = self.several[self.fan_slot]
         first, target = self._bones(joints, initial, bones, rank, self.fan_child)
         outer = target[..., :, None] * first[..., None, :]
-        sums = outer.new_zeros(len(joints), len(self.several), 3, 3).index_add(1, self.fan_slot, outer)
+        sums = outer.new_zeros(joints.shape[0], len(self.several), 3, 3).index_add(1, self.fan_slot, outer)
         sums = sums.index_add(1, self.pair[0], self._pair_normals(first, target))
         spread = rotation_from_covariance(sums) @ initial[:, self.several]
         return torch.cat((aligned, spread), 1)[:, self.order]

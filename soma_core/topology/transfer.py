@@ -72,7 +72,7 @@ class TopologyTransfer(torch.nn.Module):
     def forward(self, native: Tensor) -> Tensor:
         """Canonical rest vertices (B, v, 3) [m] from native vertices (B, n, 3). Differentiable."""
         self.check(native.shape)
-        batch, count = len(native), len(self.corners)
+        batch, count = native.shape[0], len(self.corners)
         flat = native.permute(1, 2, 0).reshape(self.native_count, 3 * batch)
         plane = self.affine(flat).view(count, 3, batch)
         raised = self.height[:, None] * raised_normal(native[:, self.corners])

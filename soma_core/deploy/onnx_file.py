@@ -1,0 +1,107 @@
+"""A deployed model as an ONNX file, and its run in onnxruntime."""
+
+from __future__ import annotations
+
+import importlib
+import json
+import logging
+import warnings
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from soma_core.cache import atomic_write
+from soma_core.deploy.program import DeployedModel
+from soma_core.errors import SomaError
+
+__all__ = ["OPSET", "needed", "open_session", "run_session", "write_onnx", "write_program"]
+
+OPSET = 18
+"""Version of ONNX's operators that files are written in."""
+
+
+def needed(name: str) -> Any:
+    """Import a package of the extra ``onnx``.
+
+    Raises:
+        SomaError: it is not installed.
+    """
+    try:
+        return importlib.import_module(name)
+    except ImportError as error:
+        raise SomaError(
+            f"ONNX files need {name}, which is not installed. Run: pip install 'soma-body-core[onnx]', or "
+            "write the torch.export program alone: write=[pt2]."
+        ) from error
+
+
+def write_onnx(path: Path, model: DeployedModel) -> None:
+    """Write an ONNX file with named inputs and outputs, an open batch, and what there is to know as metadata.
+
+    Raises:
+        SomaError: the extra ``onnx`` is not installed.
+    """
+    needed("onnxscript")
+    with warnings.catch_warnings(), _quiet("torch.onnx"):
+        warnings.simplefilter("ignore")  # of torch, about its own use of pytree (2.13)
+        made = torch.onnx.export(
+            model.program, model.example(), dynamo=True, opset_version=OPSET, optimize=False, verbose=False,
+            input_names=[*model.inputs], output_names=[*model.outputs],
+        )  # fmt: skip
+    assert made is not None
+    graph = made.model.graph
+    for node in graph.all_nodes():
+        node.metadata_props.clear()  # stack traces, with the paths of this machine
+        for value in node.outputs:  # a parameter may be called as a value inside
+            value.name = value.name if value.name in model.outputs else f"{value.name}_"
+    made.model.producer_name = "soma-body-core"
+    for name, value in model.about.items():
+        text = value if isinstance(value, str) else json.dumps(value)
+        made.model.metadata_props[f"soma.{name}"] = text
+    atomic_write(path, lambda part: made.save(part) and None)
+
+
+def write_program(path: Path, model: DeployedModel) -> None:
+    """Write the program for ``torch.export.load``; ``extra_files={"about.json": ""}`` gets what to know."""
+
+    def save(part: Path) -> None:
+        with open(part, "wb") as stream:
+            torch.export.save(model.program, stream, extra_files={"about.json": json.dumps(model.about)})
+
+    atomic_write(path, save)
+
+
+class _quiet:
+    """Only errors of a logger: torch lists packages that have nothing to do with the model."""
+
+    def __init__(self, name: str) -> None:
+        self.logger = logging.getLogger(name)
+
+    def __enter__(self) -> None:
+        self.before = self.logger.level
+        self.logger.setLevel(logging.ERROR)
+
+    def __exit__(self, *_: object) -> None:
+        self.logger.setLevel(self.before)
+
+
+def open_session(path: Path, *, threads: int = 1) -> Any:
+    """An ``onnxruntime.InferenceSession`` on the CPU.
+
+    Raises:
+        SomaError: onnxruntime is not installed.
+    """
+    runtime = needed("onnxruntime")
+    options = runtime.SessionOptions()
+    options.intra_op_num_threads = options.inter_op_num_threads = threads
+    return runtime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
+
+
+def run_session(session: Any, inputs: Mapping[str, Any]) -> dict[str, np.ndarray]:
+    """Outputs by their names, of inputs by theirs: tensors or arrays, each with the same batch."""
+    names = [output.name for output in session.get_outputs()]
+    arrays = {name: np.asarray(value, np.float32) for name, value in inputs.items()}
+    return dict(zip(names, session.run(names, arrays), strict=True))
