@@ -27,6 +27,8 @@ __all__ = [
     "Kernels",
     "LengthUnit",
     "Lod",
+    "ModelFile",
+    "ModelPart",
     "Product",
     "Refine",
     "RotationLayout",
@@ -183,6 +185,21 @@ class Lod(StrEnum):
     mid = "mid"
     low = "low"
     xlo = "xlo"
+
+
+class ModelFile(StrEnum):
+    """What ``soma export-model`` writes: a file for ONNX runtimes, or one for ``torch.export.load``."""
+
+    onnx = "onnx"
+    pt2 = "pt2"
+
+
+class ModelPart(StrEnum):
+    """What a model without this package computes: poses of one body, of any body, or joints alone."""
+
+    pose = "pose"
+    full = "full"
+    joints = "joints"
 
 
 class Product(StrEnum):

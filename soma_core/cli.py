@@ -71,6 +71,9 @@ TASKS = {
         summary="learn pose correctives from a teacher: elastic skin, or a backend",
     ),
     "evaluate": TaskRow(module="evaluate", summary="measure a claim of the paper, in millimetres"),
+    "export-model": TaskRow(
+        module="export_model", summary="write a body model as ONNX and torch.export, for use without this package"
+    ),
     "bench": TaskRow(module="bench", summary="time the forward path, correctness first"),
     "view": TaskRow(module="view", summary="serve a page that shows bodies, poses them and plays motions"),
 }

@@ -17,6 +17,9 @@ from soma_core.choices import (
     IdentitySource,
     Kernels,
     LengthUnit,
+    Lod,
+    ModelFile,
+    ModelPart,
     Product,
     Translation,
 )
@@ -34,6 +37,7 @@ __all__ = [
     "CorrectivesData",
     "EvaluateConfig",
     "Experiment",
+    "ExportModelConfig",
     "InvertConfig",
     "TrainCorrectivesConfig",
     "TrainShapeConfig",
@@ -207,6 +211,20 @@ class BenchConfig:
     seed: int = 0
 
 
+@dataclass(kw_only=True)
+class ExportModelConfig(Options):
+    """Configuration of ``soma export-model``."""
+
+    backend: BackendChoice = field(default_factory=_any_backend)
+    what: ModelPart = ModelPart.pose
+    write: list[ModelFile] = field(default_factory=lambda: [ModelFile.onnx, ModelFile.pt2])
+    parameters: list[str] | None = None
+    lod: Lod = Lod.low
+    procedural: bool = True
+    correctives: str | None = "auto"
+    seed: int = 0
+
+
 @dataclass
 class WrapConfig:
     """Configuration of ``soma wrap``."""
@@ -233,6 +251,7 @@ SCHEMAS: dict[str, type] = {
     "train_correctives": TrainCorrectivesConfig,
     "evaluate": EvaluateConfig,
     "bench": BenchConfig,
+    "export_model": ExportModelConfig,
     "wrap": WrapConfig,
     "view": ViewConfig,
 }

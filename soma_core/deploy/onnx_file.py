@@ -52,6 +52,9 @@ def write_onnx(path: Path, model: DeployedModel) -> None:
             input_names=[*model.inputs], output_names=[*model.outputs],
         )  # fmt: skip
     assert made is not None
+    optimizer = needed("onnxscript.optimizer")
+    optimizer.fold_constants(made.model)
+    optimizer.remove_unused_nodes(made.model)  # its whole optimizer takes minutes for some thousand nodes
     graph = made.model.graph
     for node in graph.all_nodes():
         node.metadata_props.clear()  # stack traces, with the paths of this machine

@@ -4,24 +4,22 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal, get_args
+from typing import Any
 
 import torch
 from torch import Tensor
 
-from soma_core._inputs import check_choice
 from soma_core._version import __version__
 from soma_core.animation.engine import Body
 from soma_core.backends.parameters import batch_parameters
+from soma_core.choices import ModelPart
 from soma_core.deploy.blocks import without_sparse
 from soma_core.errors import InputError
 from soma_core.geometry.rotations import axis_angle_to_matrix
 from soma_core.layer import SomaLayer
 from soma_core.plugin.declaration import did_you_mean
 
-__all__ = ["DeployedModel", "Part", "deploy"]
-
-Part = Literal["pose", "full", "joints"]
+__all__ = ["DeployedModel", "deploy"]
 
 _EXAMPLE = 5
 """Bodies that a program is traced with: no other size of the model, so that only the batch stays open."""
@@ -59,11 +57,11 @@ class DeployedModel:
 class _Body(torch.nn.Module):
     """What is traced. The layer stands in a list: of a child's buffers, unused ones would be kept too."""
 
-    def __init__(self, layer: SomaLayer, part: Part, fixed: Mapping[str, Tensor], names: Sequence[str]) -> None:
+    def __init__(self, layer: SomaLayer, part: ModelPart, fixed: Mapping[str, Tensor], names: Sequence[str]) -> None:
         super().__init__()
         self.part, self.fixed, self.names, self._layer = part, dict(fixed), tuple(names), [layer]
         with torch.no_grad():
-            self.identity = None if part == "full" else layer.identity(self.fixed)
+            self.identity = None if part is ModelPart.full else layer.identity(self.fixed)
 
     def forward(self, rotations: Tensor, translation: Tensor, *values: Tensor) -> tuple[Tensor, ...]:
         layer, identity = self._layer[0], self.identity
@@ -73,7 +71,7 @@ class _Body(torch.nn.Module):
             params = {name: value.expand(batch, *value.shape[1:]) for name, value in given.items()}
             identity = layer._identity(params, *layer.rest_shape(params))
         body = Body(identity, axis_angle_to_matrix(rotations), translation)
-        if self.part == "joints":
+        if self.part is ModelPart.joints:
             world = layer.animation.transforms(body, absolute=False)
             return world[:, 1:, :3, 3], world
         posed = layer.pose_checked(body)
@@ -82,7 +80,7 @@ class _Body(torch.nn.Module):
 
 def deploy(
     layer: SomaLayer,
-    part: Part = "pose",
+    part: ModelPart = ModelPart.pose,
     *,
     params: Mapping[str, Any] | None = None,
     parameters: Sequence[str] | None = None,
@@ -98,7 +96,6 @@ def deploy(
     Raises:
         InputError: unknown names; a backend whose generator torch.export cannot follow, of ``full``.
     """
-    check_choice("what", part, get_args(Part))
     given = layer._given | {"kernels": "torch", "device": "cpu", "dtype": torch.float32}
     plain = type(layer)(**given)
     fixed = batch_parameters(plain.spec, params, device=plain.device, dtype=plain.dtype)
@@ -110,7 +107,7 @@ def deploy(
     users = len(plain.joint_names)
     inputs = {"rotations": (users, 3), "translation": (3,)} | {name: shapes[name] for name in names}
     outputs: dict[str, tuple[int, ...]] = {"joints": (users, 3), "transforms": (users + 1, 4, 4)}
-    if part != "joints":
+    if part is not ModelPart.joints:
         outputs = {"vertices": (plain.mesh.vertex_count, 3)} | outputs
     kept = {name: value for name, value in fixed.items() if name not in names}
     about = _about(plain, part, kept, inputs, outputs)
@@ -118,13 +115,13 @@ def deploy(
     return DeployedModel(program=program, inputs=inputs, outputs=outputs, about=about)
 
 
-def _inputs(layer: SomaLayer, part: Part, parameters: Sequence[str] | None) -> list[str]:
+def _inputs(layer: SomaLayer, part: ModelPart, parameters: Sequence[str] | None) -> list[str]:
     """Names of the parameters that are inputs."""
     declared = {parameter.name: parameter for parameter in layer.spec.params}
-    if part != "full":
+    if part is not ModelPart.full:
         if parameters:
             raise InputError(
-                "parameters", got=f"{', '.join(parameters)} with what={part}", expected="what=full",
+                "parameters", got=f"{', '.join(parameters)} with what={part.value}", expected="what=full",
                 fix="Pass what=full, or set one body by backend.params.NAME=VALUE.",
             )  # fmt: skip
         return []
@@ -163,7 +160,7 @@ def _traced(
 
 def _about(
     layer: SomaLayer,
-    part: Part,
+    part: ModelPart,
     fixed: Mapping[str, Tensor],
     inputs: Mapping[str, tuple[int, ...]],
     outputs: Mapping[str, tuple[int, ...]],
@@ -183,15 +180,15 @@ def _about(
 
     about: dict[str, Any] = {
         "producer": f"soma-body-core {__version__}",
-        "what": part,
+        "what": part.value,
         "backend": layer.backend,
         "licence": spec.licence,
         "lod": layer.mesh.lod,
         "rig_revision": rig.revision,
         "unit": "m",
         "axes": "right-handed, +Y up, the body faces +Z",
-        "correctives": layer.correctives is not None and part != "joints",
-        "twist_joints": layer.procedural and part != "joints",
+        "correctives": layer.correctives is not None and part is not ModelPart.joints,
+        "twist_joints": layer.procedural and part is not ModelPart.joints,
         "identity": {name: value[0].tolist() for name, value in fixed.items()},
         "inputs": named(inputs),
         "outputs": named(outputs),
@@ -199,6 +196,6 @@ def _about(
         "transform_names": list(rig.joint_names),
         "transform_parents": [int(parent) for parent in rig.parents],
     }
-    if part != "joints":
+    if part is not ModelPart.joints:
         about["triangles"] = layer.mesh.triangles.ravel().tolist()
     return about

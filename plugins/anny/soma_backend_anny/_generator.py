@@ -70,7 +70,7 @@ class AnnyGenerator:
     def _coefficients(self, params: Mapping[str, Tensor]) -> Tensor:
         """Coefficients (batch, k) of the basis; zero when every parameter has its default."""
         self._check_enabled(params)
-        batch = next((len(value) for value in params.values()), 1)
+        batch = next((value.shape[0] for value in params.values()), 1)
         middle = self._template.new_full((batch,), 0.5)
         phenotypes = {name: params.get(name, middle) for name in _basis.PHENOTYPES}
         coefficients = macro_weights(phenotypes) @ self._projection + self._offset
