@@ -13,7 +13,7 @@ from torch import Tensor
 
 from soma_core.backends.parameters import batch_parameters
 from soma_core.geometry.constants import constant
-from soma_core.geometry.torch_func import untracked
+from soma_core.geometry.torch_func import exporting, untracked
 from soma_core.plugin.errors import PluginError, Stage
 from soma_core.plugin.spec import BackendSpec, Generator, HasLinearBasis, LinearBasis
 from soma_core.rig.mesh import CanonicalMesh
@@ -70,6 +70,9 @@ class ExactRestShape(torch.nn.Module):
 _PIECES = (12, 6, 3, 1)
 """Parts of a basis that each take a thread; three times as many numbers as points leave no rest."""
 
+_SUMMED = 32
+"""Directions of a basis that are added up in one run where the product is another engine's."""
+
 
 class ComposedRestShape(torch.nn.Module):
     """A linear backend as one matrix: vertices and skeleton moments from coefficients in one product.
@@ -111,7 +114,10 @@ class ComposedRestShape(torch.nn.Module):
         """Vertices as planes (3, v, B) [m] and fitted transforms (B, J, 4, 4) [m]."""
         coefficients = self.coefficients(params)
         rows, many = coefficients, len(self.basis)
-        if rows.device.type != "cpu":  # a body's numbers lie together, as the kernels that follow read them
+        if exporting():  # engines add up in one run, which rounds three times as much
+            pairs = zip(self.basis.split(_SUMMED, 1), rows.split(_SUMMED, 1), strict=True)
+            stacked = self.template + sum(part @ column.T for part, column in pairs)
+        elif rows.device.type != "cpu":  # a body's numbers lie together, as the kernels that follow read them
             stacked = torch.addmm(self.template.flatten(), rows, self.basis.T).T
         elif rows.shape[0] == 1:  # of one column MKL makes pieces four times as fast as the whole
             parts = next(count for count in _PIECES if many % count == 0)

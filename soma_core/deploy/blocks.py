@@ -126,7 +126,9 @@ class BlockSkinning(torch.nn.Module):
 
 def without_sparse(module: torch.nn.Module, *, dtype: torch.dtype, device: torch.device | str) -> None:
     """Put blocks in the place of every sparse product and skinning below a module."""
-    for name, child in list(module.named_children()):
+    for name, child in list(module._modules.items()):  # named_children() leaves out a second name of one child
+        if child is None:
+            continue
         if isinstance(child, Skinning):
             setattr(module, name, BlockSkinning(child.weights.scipy(), dtype=dtype, device=device))
         elif isinstance(child, SparseRows):

@@ -72,7 +72,9 @@ def write_program(path: Path, model: DeployedModel) -> None:
 
     def save(part: Path) -> None:
         with open(part, "wb") as stream:
-            torch.export.save(model.program, stream, extra_files={"about.json": json.dumps(model.about)})
+            with warnings.catch_warnings():
+                warnings.filterwarnings("ignore", "No complete tensor")  # matters off the CPU (torch 2.13)
+                torch.export.save(model.program, stream, extra_files={"about.json": json.dumps(model.about)})
 
     atomic_write(path, save)
 

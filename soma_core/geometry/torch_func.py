@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 from torch.autograd import forward_ad
 
-__all__ = ["transformed", "untracked"]
+__all__ = ["exporting", "transformed", "untracked"]
 
 
 def transformed() -> bool:
@@ -20,6 +20,11 @@ def transformed() -> bool:
     if torch.compiler.is_compiling():
         return False
     return forward_ad._current_level >= 0 or torch._C._are_functorch_transforms_active()
+
+
+def exporting() -> bool:
+    """Whether ``torch.export`` follows what is computed; torch before 2.7 does not say."""
+    return getattr(torch.compiler, "is_exporting", bool)()
 
 
 def untracked(*given: Tensor | None) -> bool:

@@ -14,7 +14,7 @@ import torch
 from omegaconf import OmegaConf
 
 from soma_core.cache import atomic_text
-from soma_core.choices import ModelFile
+from soma_core.choices import ModelFile, ModelPart
 from soma_core.deploy.onnx_file import needed, open_session, run_session, write_onnx, write_program
 from soma_core.deploy.program import DeployedModel, deploy
 from soma_core.errors import InputError, SomaError
@@ -31,8 +31,11 @@ __all__ = ["compare", "random_inputs", "run"]
 
 _log = logging.getLogger(__name__)
 
-_AGREEMENT_MM = 1e-3
-"""Largest distance from the layer: some roundings of float32 at the size of a body."""
+_AGREEMENT_MM = {ModelPart.pose: 1e-3, ModelPart.joints: 1e-3, ModelPart.full: 3e-3}
+"""Largest distance from the layer: some roundings of float32 at the size of a body, and those of the fit.
+
+Of what is fitted, the layer itself is up to 1.4e-3 mm from its own float64.
+"""
 
 _BATCHES = (1, 7)
 _REPEATS = 20
@@ -89,8 +92,9 @@ def _report(path: Path, model: DeployedModel, layer: SomaLayer, options: ExportM
         "onnxruntime: %.2g mm from the layer at most, %.2g ms a frame on one core (batch 1)",
         worst, 1e3 * statistics.median(times),
     )  # fmt: skip
-    if not worst <= _AGREEMENT_MM:
-        raise SomaError(f"{path}: {worst:.3g} mm from the layer, bound {_AGREEMENT_MM:g}.")
+    bound = _AGREEMENT_MM[options.what]
+    if not worst <= bound:
+        raise SomaError(f"{path}: {worst:.3g} mm from the layer, bound {bound:g}.")
 
 
 def random_inputs(
