@@ -72,7 +72,8 @@ TASKS = {
     ),
     "evaluate": TaskRow(module="evaluate", summary="measure a claim of the paper, in millimetres"),
     "export-model": TaskRow(
-        module="export_model", summary="write a body model as ONNX and torch.export, for use without this package"
+        module="export_model",
+        summary="write a body model as ONNX and torch.export, for use without this package",
     ),
     "bench": TaskRow(module="bench", summary="time the forward path, correctness first"),
     "view": TaskRow(module="view", summary="serve a page that shows bodies, poses them and plays motions"),

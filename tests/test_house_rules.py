@@ -62,7 +62,7 @@ RANKS = [
     },
     {"geometry", "plugin"}, {"kernels", "_inputs", "_derived"},
     {"rig", "topology", "skeleton", "animation", "correctives"}, {"backends", "io"}, {"compiled", "points"},
-    {"layer"}, {"inversion"}, {"native", "registration"}, {"view"}, {"motion"},
+    {"layer"}, {"inversion", "deploy"}, {"native", "registration"}, {"view"}, {"motion"},
     {"config", "shape_space", "template", "testing"}, {"evaluation", "viewer"}, {"tasks"}, {"cli"},
 ]  # fmt: skip
 RANK = {name: rank for rank, names in enumerate(RANKS) for name in names}

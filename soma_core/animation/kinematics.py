@@ -137,4 +137,5 @@ class Kinematics(torch.nn.Module):
             step = (above @ offsets.index_select(1, level)[..., None]).squeeze(-1)
             places.append(places[-1].index_select(1, parent) + step)
             turns.append(above @ relative.index_select(1, level))
-        return (torch.cat(parts, 1).index_select(1, self.restore) for parts in (turns, places))
+        joined = torch.cat(turns, 1), torch.cat(places, 1)
+        return joined[0].index_select(1, self.restore), joined[1].index_select(1, self.restore)

@@ -24,9 +24,9 @@ _FEW = 16
 
 
 def split_rows(matrix: scipy.sparse.csr_array) -> list[np.ndarray]:
-    """Sets of rows whose dense blocks, on the columns that each set uses, hold few zeros; empty rows left out.
+    """Sets of rows whose dense blocks, on the columns that each set uses, hold few zeros.
 
-    Each set is halved by whether a row uses one column: the one that spares most entries.
+    Empty rows are in none. Each set is halved by whether a row uses one column: the one that spares most entries.
     """
     pattern = scipy.sparse.csr_array((np.ones(matrix.nnz), matrix.indices, matrix.indptr), shape=matrix.shape)
     todo, done = [np.flatnonzero(np.diff(pattern.indptr))], []
@@ -126,7 +126,9 @@ class BlockSkinning(torch.nn.Module):
 
 def without_sparse(module: torch.nn.Module, *, dtype: torch.dtype, device: torch.device | str) -> None:
     """Put blocks in the place of every sparse product and skinning below a module."""
-    for name, child in list(module._modules.items()):  # named_children() leaves out a second name of one child
+    for name, child in list(
+        module._modules.items()
+    ):  # named_children() leaves out a second name of one child
         if child is None:
             continue
         if isinstance(child, Skinning):

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import importlib
 import json
 import logging
 import warnings
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -64,33 +65,30 @@ def write_onnx(path: Path, model: DeployedModel) -> None:
     for name, value in model.about.items():
         text = value if isinstance(value, str) else json.dumps(value)
         made.model.metadata_props[f"soma.{name}"] = text
-    atomic_write(path, lambda part: made.save(part) and None)
+    atomic_write(path, made.save)
 
 
 def write_program(path: Path, model: DeployedModel) -> None:
     """Write the program for ``torch.export.load``; ``extra_files={"about.json": ""}`` gets what to know."""
 
     def save(part: Path) -> None:
-        with open(part, "wb") as stream:
-            with warnings.catch_warnings():
-                warnings.filterwarnings("ignore", "No complete tensor")  # matters off the CPU (torch 2.13)
-                torch.export.save(model.program, stream, extra_files={"about.json": json.dumps(model.about)})
+        with open(part, "wb") as stream, warnings.catch_warnings():
+            warnings.filterwarnings("ignore", "No complete tensor")  # matters off the CPU (torch 2.13)
+            torch.export.save(model.program, stream, extra_files={"about.json": json.dumps(model.about)})
 
     atomic_write(path, save)
 
 
-class _quiet:
+@contextlib.contextmanager
+def _quiet(name: str) -> Iterator[None]:
     """Only errors of a logger: torch lists packages that have nothing to do with the model."""
-
-    def __init__(self, name: str) -> None:
-        self.logger = logging.getLogger(name)
-
-    def __enter__(self) -> None:
-        self.before = self.logger.level
-        self.logger.setLevel(logging.ERROR)
-
-    def __exit__(self, *_: object) -> None:
-        self.logger.setLevel(self.before)
+    logger = logging.getLogger(name)
+    before = logger.level
+    logger.setLevel(logging.ERROR)
+    try:
+        yield
+    finally:
+        logger.setLevel(before)
 
 
 def open_session(path: Path, *, threads: int = 1) -> Any:

@@ -57,7 +57,9 @@ class DeployedModel:
 class _Body(torch.nn.Module):
     """What is traced. The layer stands in a list: of a child's buffers, unused ones would be kept too."""
 
-    def __init__(self, layer: SomaLayer, part: ModelPart, fixed: Mapping[str, Tensor], names: Sequence[str]) -> None:
+    def __init__(
+        self, layer: SomaLayer, part: ModelPart, fixed: Mapping[str, Tensor], names: Sequence[str]
+    ) -> None:
         super().__init__()
         self.part, self.fixed, self.names, self._layer = part, dict(fixed), tuple(names), [layer]
         with torch.no_grad():
@@ -170,12 +172,14 @@ def _about(
     declared = {parameter.name: parameter for parameter in spec.params}
 
     def named(shapes: Mapping[str, tuple[int, ...]]) -> list[dict[str, Any]]:
-        rows = [{"name": name, "shape": ["batch", *shape]} for name, shape in shapes.items()]
-        for row in rows:
-            parameter = declared.get(str(row["name"]))
-            row["meaning"] = _MEANING.get(str(row["name"])) or (parameter.description if parameter else "")
+        rows = []
+        for name, shape in shapes.items():
+            parameter = declared.get(name)
+            row: dict[str, Any] = {"name": name, "shape": ["batch", *shape]}
+            row["meaning"] = _MEANING.get(name) or (parameter.description if parameter else "")
             if parameter is not None:
                 row |= {"default": parameter.default, "range": list(parameter.range)}
+            rows.append(row)
         return rows
 
     about: dict[str, Any] = {

@@ -1,4 +1,4 @@
-"""``soma export-model``: a body model as ONNX and ``torch.export``, compared with the layer it was made of."""
+"""``soma export-model``: a body model as ONNX and ``torch.export``, compared with its layer."""
 
 from __future__ import annotations
 

@@ -99,7 +99,7 @@ def test_a_file_for_onnx_says_what_it_takes(layer, tmp_path):
 def test_what_cannot_be_deployed_is_named(layer, tmp_path, monkeypatch):
     with pytest.raises(InputError, match="parameters: got size with what=pose, expected what=full"):
         deploy(layer, parameters=["size"])
-    with pytest.raises(InputError, match='got \'sise\'.*Did you mean "size"'):
+    with pytest.raises(InputError, match="got 'sise'.*Did you mean \"size\""):
         deploy(layer, ModelPart.full, parameters=["sise"])
     with pytest.raises(InputError, match="got several bodies"):
         deploy(layer, params={"size": [1.0, 1.1]})
