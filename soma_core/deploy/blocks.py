@@ -26,7 +26,7 @@ _FEW = 16
 def split_rows(matrix: scipy.sparse.csr_array) -> list[np.ndarray]:
     """Sets of rows whose dense blocks, on the columns that each set uses, hold few zeros.
 
-    Empty rows are in none. Each set is halved by whether a row uses one column: the one that spares most entries.
+    Empty rows are in none. A set is halved by whether a row uses one column: that which spares most entries.
     """
     pattern = scipy.sparse.csr_array((np.ones(matrix.nnz), matrix.indices, matrix.indptr), shape=matrix.shape)
     todo, done = [np.flatnonzero(np.diff(pattern.indptr))], []
