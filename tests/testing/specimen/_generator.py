@@ -16,7 +16,7 @@ class Specimen:
 
     def __init__(self, path, strength, *, device, dtype):
         vertices, faces = read_obj(path)
-        template = torch.as_tensor(vertices)
+        template = torch.tensor(vertices)  # a copy: the file is read once
         x, y, z = template.T / 100
         zero = torch.zeros_like(x)
         bump = torch.exp(-((z - 1) ** 2 + x**2) / 0.02)
