@@ -37,6 +37,7 @@ def _readmes(_app: object, _page: str, source: list[str]) -> None:
     """Make pages of the READMEs elsewhere in the repository that a page links to."""
     for folder in _README.findall(source[0]):
         text = (_HERE.parent / folder / "README.md").read_text(encoding="utf-8")
+        text = re.sub(r"\]\((\.\./)+docs/", "](../", text)
         page = _HERE / "_readmes" / f"{folder.replace('/', '_')}.md"
         page.parent.mkdir(exist_ok=True)
         page.write_text(f"---\norphan: true\n---\n{text}", encoding="utf-8")
