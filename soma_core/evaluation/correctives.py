@@ -11,6 +11,7 @@ import torch
 from omegaconf import DictConfig
 from torch import Tensor
 
+from soma_core.correctives.bones import bony_share
 from soma_core.correctives.elastic import ElasticSurface
 from soma_core.correctives.masks import find_creases, vertex_mask
 from soma_core.correctives.model import Correctives, find_correctives
@@ -18,6 +19,8 @@ from soma_core.correctives.poses import random_rotations
 from soma_core.correctives.weights import CorrectiveWeights, read_weights
 from soma_core.errors import AssetError
 from soma_core.evaluation.report import Figure, Report, ShownBody, Table
+from soma_core.geometry.laplacian import random_walk
+from soma_core.geometry.mesh import vertex_normals
 from soma_core.geometry.rotations import axis_angle_to_matrix
 from soma_core.io import read_motion
 from soma_core.layer import SomaLayer
@@ -40,6 +43,16 @@ _BENDS = (
     ("knee", "LeftShin", (1.0, 0.0, 0.0)),
 )
 _BEND_DEG = 120.0
+
+_SHOWN = (
+    *_BENDS,
+    ("hip", "LeftLeg", (-1.0, 0.0, 0.0)),
+    ("shoulder", "LeftArm", (0.0, 0.0, 1.0)),
+)
+_SHOWN_DEG = {"knee": (30, 60, 90, 120, 150), "elbow": (30, 60, 90, 120, 150), "hip": (30, 60, 90, 120)}
+_RAISED_DEG = (30, 60, 90)
+_TURN_SLACK, _BULGE, _RING = 1.0, 3.0, 30.0
+_OVER_BONE = 0.5
 
 _BODIES: tuple[tuple[str, str, Mapping[str, float]], ...] = (
     ("soma", "native space, mean", {}),
@@ -98,9 +111,7 @@ def _section_figures(subject: _Subject) -> list[Figure]:
     rig, sections = subject.rig, subject.surface.sections
     figures = []
     for label, joint, axis in _BENDS:
-        relative = subject.surface.body.bind_pose.clone()
-        turn = np.radians(_BEND_DEG) * torch.tensor(axis, dtype=torch.float64)
-        relative[0, rig.user_joint_names.index(joint)] = axis_angle_to_matrix(turn)
+        relative = _bent(subject, joint, axis, _BEND_DEG)
         centres = sections.posed_centres(subject.surface.body.transforms(relative))
         row = int(np.flatnonzero(sections.joints == rig.joint_names.index(joint))[0])
         volumes = [sections.volumes(v.numpy(), centres)[0, row] for v in subject.compare(relative)]
@@ -115,6 +126,54 @@ def _section_figures(subject: _Subject) -> list[Figure]:
             ),
         ]  # fmt: skip
     return figures
+
+
+def _bent(subject: _Subject, joint: str, axis: tuple[float, float, float], degrees: float) -> Tensor:
+    """The bind pose with one joint turned from the T-pose, (1, J - 1, 3, 3)."""
+    relative = subject.surface.body.bind_pose.clone()
+    turn = np.radians(degrees) * torch.tensor(axis, dtype=torch.float64)
+    relative[0, subject.rig.user_joint_names.index(joint)] = axis_angle_to_matrix(turn)
+    return relative
+
+
+def _shape_rows(subject: _Subject) -> list[list[str | float | None]]:
+    """How joints look when they bend: normals, and the skin over the bone of knees and elbows.
+
+    A row holds the joint, the angle, the farthest that a normal turns against the bone above [degrees] by twist
+    skinning and with correctives, how much farther than at rest skin over bone is from the joint [mm], and
+    the largest Laplacian of that distance [1/m]: a ring around the kneecap has a large one.
+    """
+    rig, mesh, body = subject.rig, subject.mesh, subject.surface.body
+    rest, triangles, edges = rig.bind_shape, mesh.triangles, mesh.edges()
+    creases = find_creases(rig)
+    bones, ridge = bony_share(rig, creases), random_walk(edges, len(rest))
+    squared = ((rest[edges[:, 0]] - rest[edges[:, 1]]) ** 2).sum(1)
+    ends = edges.T.ravel()
+    spacing = np.bincount(ends, np.tile(squared, 2)) / np.bincount(ends)  # mean squared edge of a vertex
+    normals = vertex_normals(rest, triangles)
+    rows: list[list[str | float | None]] = []
+    for label, name, axis in _SHOWN:
+        joint = rig.joint_names.index(name)
+        near = np.linalg.norm(rest - rig.bind_world[joint, :3, 3], axis=1) < 2 * creases.radius[joint]
+        for degrees in _SHOWN_DEG.get(label, _RAISED_DEG):
+            relative = _bent(subject, name, axis, degrees)
+            transforms = body.transforms(relative)
+            plain, corrected, _ = (found[0].numpy() for found in subject.compare(relative))
+            above = transforms[0, rig.parents[joint], :, :3].numpy()
+            turns = [
+                np.degrees(np.arccos(np.clip(((vertex_normals(v, triangles) @ above) * normals).sum(1), -1, 1)))
+                for v in (plain, corrected)
+            ]
+            row = [label, degrees, *(float(turn[near].max()) for turn in turns)]
+            if joint in bones:
+                place = rig.bind_world[joint, :3, 3]
+                moved = transforms[0, joint, :, :3].numpy() @ place + transforms[0, joint, :, 3].numpy()
+                farther = np.linalg.norm(corrected - moved, axis=1) - np.linalg.norm(rest - place, axis=1)
+                over = bones[joint] > _OVER_BONE
+                curved = 4 * np.abs(ridge @ farther) / spacing
+                row += [1e3 * float(farther[over].max()), float(curved[over].max())]
+            rows.append([*row, *[None] * (6 - len(row))])
+    return rows
 
 
 def _exact_figures(subject: _Subject, weights: CorrectiveWeights) -> list[Figure]:
