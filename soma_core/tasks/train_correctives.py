@@ -245,11 +245,15 @@ def _provenance(
 
 
 def _commit() -> str:
-    """Commit of a source checkout; empty for an installed package."""
+    """Commit of a source checkout, a linked worktree too; empty for an installed package."""
     git = Path(__file__).resolve().parents[2] / ".git"
     try:
+        shared = git
+        if git.is_file():
+            git = Path(git.read_text(encoding="utf-8").removeprefix("gitdir: ").strip())
+            shared = git / (git / "commondir").read_text(encoding="utf-8").strip()
         head = (git / "HEAD").read_text(encoding="utf-8").strip()
-        return (git / head.removeprefix("ref: ")).read_text(encoding="utf-8").strip()
+        return (shared / head.removeprefix("ref: ")).read_text(encoding="utf-8").strip()
     except OSError:
         return ""
 
