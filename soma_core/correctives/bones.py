@@ -1,4 +1,4 @@
-"""Bone under the skin: where a limb keeps its shape in front of a bent joint, and its flesh gives way behind."""
+"""Bone under the skin: a bent limb keeps its shape in front of the joint, and its flesh gives way behind."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from soma_core.rig.skeleton import Rig
 __all__ = ["Bones", "bony_share"]
 
 _FRONT = (("Shin", (0.0, 0.0, 1.0)), ("ForeArm", (0.0, 0.0, -1.0)))
-"""Hinges with bone right under the skin (kneecap, condyles, tip of the elbow), and where it lies: in the T-pose
-world, +Z forward. A shoulder or a hip has flesh all around."""
+"""Hinges with bone right under the skin (kneecap, condyles, tip of the elbow), and where it lies: in the
+T-pose world, +Z forward. A shoulder or a hip has flesh all around."""
 
 _AROUND = (-0.7, -0.1)
-"""Cosine of the angle to that direction, about the limb, between which flesh turns into bone: all but the back."""
+"""Cosine of the angle to that direction, about the limb, between which flesh turns into bone."""
 
 _ALONG = (0.4, 1.3)
 """Distance along the limb, in its thicknesses, between which bone turns into flesh."""

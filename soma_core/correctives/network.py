@@ -88,7 +88,7 @@ class CorrectivesNetwork(torch.nn.Module):
     def take_first(self, matrix: scipy.sparse.csr_array) -> None:
         """Set W1 to a matrix (6 J, J C) of the same masks and channels; see :meth:`first_matrix`."""
         table, channels = self.reads.cpu().numpy(), self.channels
-        padded = np.pad(matrix.toarray(), ((0, 6), (0, 0)))  # absent joints read the zeros behind the last one
+        padded = np.pad(matrix.toarray(), ((0, 6), (0, 0)))  # absent joints read the zeros at the end
         row = 6 * table[:, :, None, None] + np.arange(6)[:, None]
         column = channels * self.joints[:, None, None, None] + np.arange(channels)
         self.first.copy_(torch.as_tensor(padded[row, column]).view_as(self.first))

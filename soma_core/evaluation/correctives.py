@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
@@ -51,7 +52,10 @@ _SHOWN = (
 )
 _SHOWN_DEG = {"knee": (30, 60, 90, 120, 150), "elbow": (30, 60, 90, 120, 150), "hip": (30, 60, 90, 120)}
 _RAISED_DEG = (30, 60, 90)
-_TURN_SLACK, _BULGE, _RING = 1.0, 3.0, 30.0
+_HELD_TO = 120
+"""Angles beyond are shown, and not held to a bound: the poses that were taught end at 145 degrees."""
+
+_FARTHER, _BULGE, _RING = 0.0, 5.0, 20.0
 _OVER_BONE = 0.5
 
 _BODIES: tuple[tuple[str, str, Mapping[str, float]], ...] = (
@@ -136,12 +140,12 @@ def _bent(subject: _Subject, joint: str, axis: tuple[float, float, float], degre
     return relative
 
 
-def _shape_rows(subject: _Subject) -> list[list[str | float | None]]:
+def _shape_rows(subject: _Subject) -> list[list[Any]]:
     """How joints look when they bend: normals, and the skin over the bone of knees and elbows.
 
-    A row holds the joint, the angle, the farthest that a normal turns against the bone above [degrees] by twist
-    skinning and with correctives, how much farther than at rest skin over bone is from the joint [mm], and
-    the largest Laplacian of that distance [1/m]: a ring around the kneecap has a large one.
+    A row holds the joint, the angle, the farthest that a normal turns against the bone above [degrees] by
+    twist skinning and with correctives, how much farther than at rest skin over bone is from the joint [mm],
+    and the largest Laplacian of that distance [1/m]: a ring around the kneecap has a large one.
     """
     rig, mesh, body = subject.rig, subject.mesh, subject.surface.body
     rest, triangles, edges = rig.bind_shape, mesh.triangles, mesh.edges()
@@ -151,7 +155,7 @@ def _shape_rows(subject: _Subject) -> list[list[str | float | None]]:
     ends = edges.T.ravel()
     spacing = np.bincount(ends, np.tile(squared, 2)) / np.bincount(ends)  # mean squared edge of a vertex
     normals = vertex_normals(rest, triangles)
-    rows: list[list[str | float | None]] = []
+    rows = []
     for label, name, axis in _SHOWN:
         joint = rig.joint_names.index(name)
         near = np.linalg.norm(rest - rig.bind_world[joint, :3, 3], axis=1) < 2 * creases.radius[joint]
@@ -160,11 +164,10 @@ def _shape_rows(subject: _Subject) -> list[list[str | float | None]]:
             transforms = body.transforms(relative)
             plain, corrected, _ = (found[0].numpy() for found in subject.compare(relative))
             above = transforms[0, rig.parents[joint], :, :3].numpy()
-            turns = [
-                np.degrees(np.arccos(np.clip(((vertex_normals(v, triangles) @ above) * normals).sum(1), -1, 1)))
-                for v in (plain, corrected)
-            ]
-            row = [label, degrees, *(float(turn[near].max()) for turn in turns)]
+            row: list[Any] = [label, degrees]
+            for vertices in (plain, corrected):
+                cosine = ((vertex_normals(vertices, triangles) @ above) * normals)[near].sum(1)
+                row.append(float(np.degrees(np.arccos(cosine.clip(-1, 1))).max()))
             if joint in bones:
                 place = rig.bind_world[joint, :3, 3]
                 moved = transforms[0, joint, :, :3].numpy() @ place + transforms[0, joint, :, 3].numpy()
@@ -174,6 +177,26 @@ def _shape_rows(subject: _Subject) -> list[list[str | float | None]]:
                 row += [1e3 * float(farther[over].max()), float(curved[over].max())]
             rows.append([*row, *[None] * (6 - len(row))])
     return rows
+
+
+def _shape_figures(rows: list[list[Any]]) -> list[Figure]:
+    """What the rows of :func:`_shape_rows` come to."""
+    held = [row for row in rows if row[1] <= _HELD_TO]
+    bony = [row for row in rows if row[4] is not None]
+    ring = max(row[5] for row in bony if row in held)
+    return [
+        Figure(
+            name="normals turn farther than by twist skinning", value=max(row[3] - row[2] for row in held),
+            unit="degrees", bound=_FARTHER,
+        ),
+        Figure(
+            name="skin over bone, farther from the joint than at rest", value=max(row[4] for row in bony),
+            unit="mm", bound=_BULGE,
+        ),
+        Figure(
+            name="skin over bone, Laplacian of that distance", value=ring, unit="1/m", bound=_RING,
+        ),
+    ]  # fmt: skip
 
 
 def _exact_figures(subject: _Subject, weights: CorrectiveWeights) -> list[Figure]:
@@ -289,6 +312,7 @@ def run(config: DictConfig) -> Report:
         left = 100 * after / before
         figures.append(Figure(name=f"error to the teacher left, {name}", value=left, unit="%", bound=_LEFT))
     clip = motions["range_of_motion"]
+    bent = _shape_rows(subject)
     body_rows, shown = _bodies(subject, clip[:: max(1, len(clip) // 16)])
     return Report(
         title="Pose correctives against their teacher, on motions held out from training",
@@ -299,13 +323,21 @@ def run(config: DictConfig) -> Report:
                 rows=rows,
             ),
             Table(
+                title="One joint bent: the farthest turn of a normal, and skin over bone",
+                columns=(
+                    "joint", "degrees", "twist skinning, degrees", "with correctives, degrees",
+                    "farther than at rest, mm", "Laplacian of that, 1/m",
+                ),
+                rows=bent,
+            ),
+            Table(
                 title="Other bodies, each against a teacher of its own (range of motion)",
                 columns=("body", "height, m", "twist skinning, mm", "with correctives, mm", "error gone, %"),
                 rows=body_rows,
             ),
         ],
         figures=[
-            *figures, *_section_figures(subject), *_exact_figures(subject, weights),
+            *figures, *_section_figures(subject), *_shape_figures(bent), *_exact_figures(subject, weights),
             *_cost_figures(weights, subject),
         ],
         notes=(

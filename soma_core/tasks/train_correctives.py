@@ -196,7 +196,9 @@ def _kept_first(config: DictConfig, masks: Masks) -> CorrectivesNetwork:
     """
     path = find_correctives(config.first, shipped=True)
     if path is None:
-        raise InputError("first", got=config.first, expected="a checkpoint", fix="Name its file, or leave it out.")
+        raise InputError(
+            "first", got=config.first, expected="a checkpoint", fix="Name its file, or leave it out."
+        )
     first = read_weights(path).first
     network = CorrectivesNetwork(masks.joints, masks.vertices, channels=config.channels, seed=config.seed)
     wanted = network.first_matrix().shape
