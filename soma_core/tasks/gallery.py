@@ -16,6 +16,7 @@ from soma_core.motion.models import open_layer
 from soma_core.plugin.errors import BackendError
 from soma_core.plugin.registry import default_registry
 from soma_core.shape_space.sampling import sample_parameters
+from soma_core.view.eyes import with_eyes
 from soma_core.view.picture import backend_colour, gallery
 from soma_core.view.stage import Body
 
@@ -92,15 +93,14 @@ def _bodies(name: str, options: AnimateConfig, pose: Motion) -> list[Body]:
     for params in choices:
         with torch.no_grad():
             identity = layer.identity(params)
-            vertices = animate(layer, identity, pose, keep=[0]).vertices[0]
+            posed = animate(layer, identity, pose, keep=[0])
         height = float(np.ptp(identity.rest[0, :, 1].cpu().numpy()))
         caption = f"{name}\n{height:.2f} m"
-        found.append(
-            Body(
-                vertices=vertices,
-                triangles=layer.mesh.triangles,
-                colour=backend_colour(name),
-                caption=caption,
-            )
+        body = Body(
+            vertices=posed.vertices[0],
+            triangles=layer.mesh.triangles,
+            colour=backend_colour(name),
+            caption=caption,
         )
+        found.append(with_eyes(body, posed.transforms[0], layer.rig))
     return found

@@ -8,8 +8,14 @@ import pytest
 import torch
 from omegaconf import OmegaConf
 
-from soma_core.errors import InputError
-from soma_core.evaluation import inversion_sequences, table2_inversion, table3_regions, unknown_identity
+from soma_core.errors import InputError, SomaError
+from soma_core.evaluation import (
+    conversion_matrix,
+    inversion_sequences,
+    table2_inversion,
+    table3_regions,
+    unknown_identity,
+)
 from soma_core.evaluation.inversion_runs import joint_angle_errors, run_methods
 from soma_core.evaluation.inversion_sequences import MovingMesh
 from soma_core.evaluation.joint_turns import own_turns
@@ -228,3 +234,42 @@ def test_people_of_annys_own_rig_are_adults_and_an_infant(monkeypatch):
     heights = [float(case.truth.rest[0, :, 1].max() - case.truth.rest[0, :, 1].min()) for case in cases]
     assert heights[2] < 1 < min(heights[:2])
     assert all(len(turns) == FRAMES - 1 for case in cases for turns in case.turns.values())
+
+
+@pytest.fixture
+def few_frames(monkeypatch):
+    monkeypatch.setattr(conversion_matrix, "_FRAMES", FRAMES)
+
+
+def test_every_ordered_pair_is_a_row_and_a_backends_own_body_is_held_to_bounds(few_frames, monkeypatch):
+    def found(layer, vertices, *, inversion):
+        identity = layer.identity()
+        return IdentityFit(
+            identity=identity, params=identity.params, pose=inversion(vertices, identity),
+            frames=torch.arange(FRAMES), history=(), converged=True,
+        )  # fmt: skip
+
+    monkeypatch.setattr(conversion_matrix, "fit_identity", found)
+    report = conversion_matrix.run(configured(count=1, methods=["soma", "toy"]))
+    pairs = [(row[0], row[1]) for row in report.tables[0].rows]
+    assert pairs == [("soma", "soma"), ("soma", "toy"), ("toy", "soma"), ("toy", "toy")]
+    assert [body.caption for body in report.bodies] == ["soma as toy", "toy as soma"]
+    assert {figure.name.split(",")[0] for figure in report.figures} == {"soma", "toy"}
+    assert report.failed  # bodies that were not looked for are other bodies
+
+
+@pytest.mark.slow
+def test_a_backends_own_body_comes_back(few_frames):
+    report = conversion_matrix.run(configured(count=1, methods=["toy"]))
+    assert not report.failed
+    (row,) = report.tables[0].rows
+    assert row[8] < 1e-4
+
+
+def test_backends_without_their_files_are_left_out_and_named(monkeypatch, tmp_path):
+    monkeypatch.setenv("SOMA_DATA_DIR", str(tmp_path))
+    fits, notes = conversion_matrix._fits(configured(methods=[]))
+    assert "soma" in [fit.layer.backend for fit in fits]
+    assert any(note.startswith("smplx was left out: ") for note in notes)
+    with pytest.raises(SomaError, match="smplx"):
+        conversion_matrix._fits(configured(methods=["smplx"]))
