@@ -40,10 +40,10 @@ _DOUBTFUL = (1e-6, 8e-4)
 """A root mean square error [m] between these is more than rounding and less than noise: such a frame may rest
 in a fold of the correctives beside its minimum, and is tried from further limb twists."""
 
-_LOPSIDED, _FAINT = (0.1, 0.15), 1e-5
-"""Median over root mean square error that is too little, where that is below and above 0.8 mm: 0.9 where
-noise is left, 0.19 to 0.47 on meshes of another rig; 0.01 to 0.08, or to 0.14 above, where limbs stopped in a
-wrong place. Then the error [m] below which all is well: every fit of what the model posed ends there."""
+_LOPSIDED, _FAINT = 0.1, 1e-5
+"""Median over root mean square error that is too little: 0.9 where noise is left, 0.14 to 0.47 on meshes of
+another rig; 0.01 to 0.08, seldom up to 0.14, where limbs stopped in a wrong place. Then the error [m] below
+which all is well: every fit of what the model posed ends there."""
 
 _OF_ONE_PIECE = 0.1
 """Least :func:`clumping` of what another rig's skin leaves: at least 0.4 on meshes of Anny's own rig, at most
@@ -88,8 +88,7 @@ def lopsided(distances: Tensor, weights: Tensor, residual: Tensor) -> Tensor:
     large = residual > _FAINT
     if not bool(large.any()):
         return large
-    below, above = (share * residual for share in _LOPSIDED)
-    return large & (median_distance(distances, weights) < torch.where(residual > _DOUBTFUL[1], above, below))
+    return large & (median_distance(distances, weights) < _LOPSIDED * residual)
 
 
 def of_another_rig(model: PoseModel, problem: Problem, result: InversionResult) -> Tensor:

@@ -212,13 +212,21 @@ def test_the_command_prints_its_address_and_ends_on_ctrl_c(tmp_path):
         sys.executable, "-c", program, "view", "lod=low", "port=0", f"hydra.run.dir={tmp_path / 'run'}"
     ]  # fmt: skip
     environment = {name: value for name, value in os.environ.items() if name != "DISPLAY"}
+
+    def interruptible() -> None:  # what runs in the background has Ctrl-C ignored, and its children too
+        signal.signal(signal.SIGINT, signal.SIG_DFL)
+
     with subprocess.Popen(
-        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment
-    ) as run:
-        lines = iter(run.stderr.readline, "")
-        address = next(line for line in lines if line.startswith("open http://127.0.0.1:"))
-        run.send_signal(signal.SIGINT)
-        out, _ = run.communicate(timeout=60)
+        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment,
+        preexec_fn=interruptible,
+    ) as run:  # fmt: skip
+        try:
+            lines = iter(run.stderr.readline, "")
+            address = next(line for line in lines if line.startswith("open http://127.0.0.1:"))
+            run.send_signal(signal.SIGINT)
+            out, _ = run.communicate(timeout=60)
+        finally:
+            run.kill()
     assert "Ctrl-C" in address
     assert run.returncode == 0
     assert out.splitlines() == [str(tmp_path / "run")]
