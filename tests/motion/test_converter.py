@@ -23,7 +23,7 @@ FIT_MM = 3.0
 """Mean distance of a fit to the stand-in, whose pose blend shapes are noise of about that size."""
 
 CARRIED_DEGREES = 12.0
-"""Angle of a limb that is carried over to the same limb fitted, in most frames: what the rest poses leave open.
+"""Angle of a limb that is carried over to the same limb fitted, in most frames: what rest poses leave open.
 The noise turns an upper arm about its bone in single frames, 2 of 60 by more than 60 degrees."""
 
 Z_UP_TO_Y_UP = np.array([[1, 0, 0], [0, 0, 1], [0, -1, 0]])
