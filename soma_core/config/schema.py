@@ -170,7 +170,6 @@ class TrainCorrectivesConfig:
     patience: int = 8
     ridge: float = 1e-4
     mebibytes: float = 4.7
-    first: str | None = None
     resume: bool = False
     seed: int = 0
     device: str = "cpu"

@@ -12,7 +12,6 @@ from torch import Tensor
 
 from soma_core.cache import content_key
 from soma_core.correctives.bind_body import BindBody
-from soma_core.correctives.bones import Bones
 from soma_core.correctives.frames import SurfaceFrames, diffused
 from soma_core.correctives.masks import find_creases, geodesic_falloff
 from soma_core.correctives.sections import Sections
@@ -35,13 +34,7 @@ _HELD_FROM = 0.7
 _REACH = 1.5
 """How far a section around a joint goes along the surface, in thicknesses of the limb."""
 
-_BONE = 6.0
-"""Pull of bone on the skin over it, on the same scale."""
-
-_SPREAD = 0.2
-"""Of the flesh: below this share of a section pressure is not evened out, or its end would bulge."""
-
-_VERSION = 2  # raise when the surface comes out differently
+_VERSION = 1  # raise when the surface comes out differently
 
 _VOLUME_STEPS = 6
 _CHUNK = 4
@@ -53,8 +46,6 @@ class ElasticSurface:
     Minimises ``sum_ij |(x_i - x_j) - (R_i + R_j)/2 (u_i - u_j)|^2 + sum_i a_i |x_i - y_i|^2`` subject to the
     volume of a section around every joint being that of the bind pose: y are skinned vertices, R their
     smooth local rotations (Direct Delta Mush: Le and Lewis 2019), a is large where skin follows one bone.
-    Over bone, in front of knees and elbows, y goes around the joint on an arc, and no pressure acts there:
-    what the fold displaces goes to the flesh of calf and thigh, forearm and upper arm (see :class:`Bones`).
     The rotations are known, so that the energy is quadratic with one matrix for all poses; the volumes are
     kept by one pressure each, found by Newton steps with the response of the bind pose.
 
@@ -84,20 +75,13 @@ class ElasticSurface:
         )
         neighbours = adjacency(edges, len(points))
         degree = np.asarray(neighbours.sum(1)).ravel()
-        creases = find_creases(rig)
-        self._bones = Bones(
-            points, self.body.weights, bind_world, rig, creases, laplacian, step=_STEP, rounds=_ROUNDS
-        )
-        self._bone = _BONE * self._bones.share
-        self._skinned = _attachment(mesh, rig, laplacian)
-        self._held = self._skinned + self._bone
+        self._held = _attachment(mesh, rig, laplacian)
         matrix = scipy.sparse.diags_array(degree + self._held) - neighbours
         self._factor = splu(matrix.tocsc())
         self._adjacency, self._degree = neighbours, degree
+        creases = find_creases(rig)
         falloff = geodesic_falloff(mesh, creases, reach=_REACH)
         self.sections = Sections(points, mesh.triangles, falloff, np.array(creases.joints), bind_world)
-        nearest = np.asarray(falloff.tocsc().max(0).todense()).ravel()
-        self._flesh = ((1 - self._bones.share) ** 2 / (_SPREAD + nearest))[:, None]
         self._response = self._volume_response(points)
         weights = self.body.weights
         self.key = content_key(_VERSION, points, weights.data, weights.indices, weights.indptr, edges)
@@ -113,29 +97,25 @@ class ElasticSurface:
     @torch.no_grad()
     def _solve(self, relative: Tensor) -> Tensor:
         transforms = self.body.transforms(relative)
-        load = self._elastic_load(self._frames(transforms).numpy())
-        load += self._skinned[:, None] * self.body.skin(transforms).numpy()
-        bones = self._bones.ids
-        load[:, bones] += self._bone[bones, None] * self._bones(transforms)
+        load = self._elastic_load(self._frames(transforms).numpy(), self.body.skin(transforms).numpy())
         centres = self.sections.posed_centres(transforms)
         found = self._equilibrium(load)
         pressure = np.zeros((len(relative), self.sections.count))
         for _ in range(_VOLUME_STEPS):
             missing = self.sections.rest_volumes - self.sections.volumes(found, centres)
             pressure += missing @ self._response
-            found = self._equilibrium(load + self._flesh * self.sections.push(found, centres, pressure))
+            found = self._equilibrium(load + self.sections.push(found, centres, pressure))
         return torch.as_tensor(found)
 
-    def _elastic_load(self, frames: np.ndarray) -> np.ndarray:
-        """Right-hand side (B, v, 3) of the equilibrium of the edges alone."""
+    def _elastic_load(self, frames: np.ndarray, skinned: np.ndarray) -> np.ndarray:
+        """Right-hand side (B, v, 3) of the equilibrium without pressure."""
         rest = self.body.identity.rest[0].numpy()
         turned = (frames @ rest[:, :, None])[..., 0]
         # half of sum_j (R_i + R_j)(u_i - u_j), as sums over neighbours
         around = self._neighbours(frames.reshape(*frames.shape[:2], 9)).reshape(frames.shape)
         own = self._degree[:, None] * rest - self._adjacency @ rest
         bent = (frames @ own[:, :, None])[..., 0] + (around @ rest[:, :, None])[..., 0]
-        load: np.ndarray = 0.5 * (bent - self._neighbours(turned))
-        return load
+        return 0.5 * (bent - self._neighbours(turned)) + self._held[:, None] * skinned
 
     def _neighbours(self, values: np.ndarray) -> np.ndarray:
         """Sum (B, v, n) over the neighbours of each vertex."""
@@ -150,9 +130,8 @@ class ElasticSurface:
 
     def _volume_response(self, points: np.ndarray) -> np.ndarray:
         """Pressures (n, n) that give back missing volumes, by the response of the bind pose."""
-        slopes = self.sections.rest_gradients(points)
-        gained = sum(slope.T @ self._factor.solve(self._flesh * slope) for slope in slopes)
-        return np.linalg.inv(gained + _COMPLIANCE * np.diag(gained.diagonal())).T
+        gained = sum(push.T @ self._factor.solve(push) for push in self.sections.rest_gradients(points))
+        return np.linalg.inv(gained + _COMPLIANCE * np.diag(gained.diagonal()))
 
 
 _COMPLIANCE = 0.05
