@@ -7,7 +7,9 @@ import sys
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
-__all__ = ["lazy_names"]
+from soma_core.errors import InputError
+
+__all__ = ["lazy_names", "needed"]
 
 
 def lazy_names(
@@ -31,3 +33,25 @@ def lazy_names(
         return value
 
     return load, lambda: sorted({*vars(here), *here.__all__})
+
+
+def needed(package: str, *parts: str, setting: str, extra: str, otherwise: str = "") -> Any:
+    """A package that an extra installs, with those of its modules that are named.
+
+    Args:
+        package: its name.
+        parts: modules below it, ``data`` of ``ray``.
+        setting: what asked for it.
+        extra: of ``soma-body-core``.
+        otherwise: what to do instead.
+
+    Raises:
+        InputError: it is not installed.
+    """
+    try:
+        for name in parts:
+            importlib.import_module(f"{package}.{name}")
+        return importlib.import_module(package)
+    except ImportError as error:
+        fix = f"Run: pip install 'soma-body-core[{extra}]'{otherwise}."
+        raise InputError(setting, got=f"no {package}", expected=f"{package} installed", fix=fix) from error

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from soma_core._lazy import needed
 from soma_core.cache import UnwritableError, atomic_arrays, atomic_write, file_sha256
 from soma_core.errors import InputError, SomaError
 from soma_core.motion.converter import Converter
@@ -44,21 +45,8 @@ _FIGURES = ("mean", "median", "p95", "max")
 
 
 def need_pyarrow() -> Any:
-    """The module ``pyarrow`` with ``pyarrow.parquet``.
-
-    Raises:
-        InputError: it is not installed.
-    """
-    try:
-        import pyarrow as pa
-        import pyarrow.compute
-        import pyarrow.parquet
-    except ImportError as error:
-        raise InputError(
-            "output", got="parquet without pyarrow installed", expected="pyarrow",
-            fix="Run: pip install 'soma-body-core[parquet]'.",
-        ) from error  # fmt: skip
-    return pa
+    """The module ``pyarrow``, or an InputError that says how to install it."""
+    return needed("pyarrow", "compute", "parquet", setting="output", extra="parquet")
 
 
 @functools.cache

@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
+from soma_core._lazy import needed
 from soma_core.errors import InputError, SomaError
 from soma_core.motion.options import DatasetOptions
 
@@ -184,20 +185,8 @@ def _one_thread() -> Iterator[None]:
 
 
 def need_ray() -> Any:
-    """The module ``ray.data``'s package.
-
-    Raises:
-        InputError: it is not installed.
-    """
-    try:
-        import ray
-        import ray.data
-    except ImportError as error:
-        raise InputError(
-            "engine", got="ray, which is not installed", expected="Ray Data",
-            fix="Run: pip install 'soma-body-core[ray]'; or pass engine=local.",
-        ) from error  # fmt: skip
-    return ray
+    """The module ``ray``, or an InputError that says how to install it."""
+    return needed("ray", "data", setting="engine", extra="ray", otherwise="; or pass engine=local")
 
 
 def pool_settings(options: DatasetOptions) -> Mapping[str, Any]:

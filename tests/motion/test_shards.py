@@ -355,3 +355,11 @@ def test_ray_gives_the_same_bytes(data, tmp_path):
     assert found.returncode == 0, found.stderr
     assert digests(tmp_path / "ray") == digests(tmp_path / "local")
     assert len(digests(tmp_path / "ray")) == 3
+
+
+@pytest.mark.parametrize(("package", "ask"), [("pyarrow", clips.need_pyarrow), ("ray", engines.need_ray)])
+def test_a_package_that_is_missing_is_named_with_its_extra(monkeypatch, package, ask):
+    monkeypatch.setitem(sys.modules, package, None)
+    extra = {"pyarrow": "parquet", "ray": "ray"}[package]
+    with pytest.raises(InputError, match=rf"got no {package}, .*pip install 'soma-body-core\[{extra}\]'"):
+        ask()
