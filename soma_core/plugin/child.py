@@ -23,6 +23,9 @@ Say = Callable[[Any], None]
 """Takes what can be written as JSON."""
 
 _MOST_BYTES = 2**26
+_STARTS_S = 600.0
+"""Time that a child has until it is ready: what it does before is none of the plugin's."""
+
 _LEAVES_S = 5.0
 """Time that a process has to be gone once it closed its pipe."""
 
@@ -32,27 +35,29 @@ class EndedError(Exception):
 
 
 def run_in_child(
-    function: str, *arguments: Any, seconds: float, preload: Sequence[str] = ()
+    function: str, *arguments: Any, seconds: float, prepare: str = "", preload: Sequence[str] = ()
 ) -> Iterator[Any]:
     """Run ``module:function`` as ``function(say, *arguments)`` in a child, and yield what it says.
 
     Args:
         function: the module and the name in it.
         arguments: texts, numbers and lists of them.
-        seconds: longest time between two documents.
+        seconds: longest time to the first document, once the child is ready, and between two.
+        prepare: another ``module:function``, called without arguments before the child is ready.
         preload: modules that the children of one call after the other share, where the system can fork.
 
     Raises:
         EndedError: the child died, raised, or was silent for longer; nothing of it is left.
     """
-    given = (*function.split(":"), arguments, dict(os.environ))
+    given = (function, arguments, prepare, [*preload], dict(os.environ))
     methods = [name for name in ("forkserver", "spawn") if name in multiprocessing.get_all_start_methods()]
     try:
         receiving, process = _started(methods[0], given, preload)
     except (EOFError, OSError):  # what is loaded before ended the process that was to fork
         receiving, process = _started(methods[-1], given, ())
     try:
-        while (document := _received(receiving, process, seconds)) is not None:
+        _received(receiving, process, _STARTS_S, "not ready")
+        while (document := _received(receiving, process, seconds, "no answer")) is not None:
             yield document[0]
     finally:
         receiving.close()
@@ -71,10 +76,10 @@ def _started(method: str, given: tuple[Any, ...], preload: Sequence[str]) -> tup
     return receiving, process
 
 
-def _received(receiving: Any, process: Any, seconds: float) -> list[Any] | None:
+def _received(receiving: Any, process: Any, seconds: float, silence: str) -> list[Any] | None:
     """The next document, wrapped; None at the end."""
     if not receiving.poll(seconds):
-        raise EndedError(f"no answer within {seconds:g} s")
+        raise EndedError(f"{silence} within {seconds:g} s")
     try:
         document = json.loads(receiving.recv_bytes(_MOST_BYTES))
     except (EOFError, OSError):
@@ -103,8 +108,19 @@ def _end(process: Any) -> None:
     process.join(_LEAVES_S)
 
 
+def _named(function: str) -> Callable[..., Any]:
+    module, _, name = function.partition(":")
+    found: Callable[..., Any] = getattr(importlib.import_module(module), name)
+    return found
+
+
 def _child(
-    connection: Any, module: str, name: str, arguments: Sequence[Any], variables: dict[str, str]
+    connection: Any,
+    function: str,
+    arguments: Sequence[Any],
+    prepare: str,
+    preload: Sequence[str],
+    variables: dict[str, str],
 ) -> None:
     """Run the function; end without asking what a plugin left behind."""
     os.environ.clear()
@@ -117,7 +133,13 @@ def _child(
         connection.send_bytes(dumps(document).encode())
 
     try:
-        getattr(importlib.import_module(module), name)(lambda said: send({"said": [said]}), *arguments)
+        for module in preload:
+            importlib.import_module(module)
+        run = _named(function)
+        if prepare:
+            _named(prepare)()
+        send({"said": []})  # ready: the caller's limit counts from here
+        run(lambda said: send({"said": [said]}), *arguments)
         send({"said": None})
     except BaseException as error:
         if os.environ.get("SOMA_STRICT") == "1":

@@ -37,6 +37,7 @@ _LOADING_S, _CHECKING_S = 300.0, 900.0
 
 _HERE = "soma_core.tasks.backends"
 _LOADS = ("soma_core.layer",)
+_SHARED = "soma_core.testing.apart:make_what_is_shared"
 
 
 def run_verb(arguments: Sequence[str], say: Callable[[str], None]) -> int:
@@ -128,7 +129,8 @@ def _load_apart(registry: Registry, name: str, seconds: float) -> None:
     """Load a backend in a child, and tell the registry how far it came."""
     stage: Stage = "import"
     try:
-        for said in run_in_child(f"{_HERE}:load_one", name, seconds=seconds, preload=_LOADS):
+        documents = run_in_child(f"{_HERE}:load_one", name, seconds=seconds, prepare=_SHARED, preload=_LOADS)
+        for said in documents:
             stage = said.get("stage", stage)
             if "state" in said:
                 told = said["error"]

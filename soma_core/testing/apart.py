@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from soma_core.errors import InputError
+from soma_core.errors import InputError, SomaError
 from soma_core.plugin.checks import Level
 from soma_core.plugin.child import EndedError, Say, run_in_child
 from soma_core.testing.report import Outcome, Report
 
-__all__ = ["check_apart", "check_one"]
+__all__ = ["check_apart", "check_one", "make_what_is_shared"]
 
 
 def check_apart(name: str, *, level: Level, only: Sequence[str], seconds: float) -> Report:
@@ -46,8 +47,9 @@ def _checked(
     found: list[Outcome] = []
     plan.pop("begun", None)
     said = run_in_child(
-        f"{__name__}:check_one", name, level, only, done, seconds=seconds, preload=("soma_core.testing.run",)
-    )
+        f"{__name__}:check_one", name, level, only, done, seconds=seconds,
+        prepare=f"{__name__}:make_what_is_shared", preload=("soma_core.testing.run",),
+    )  # fmt: skip
     try:
         for document in said:
             if "refused" in document:
@@ -68,6 +70,15 @@ def _unanswered(begun: Mapping[str, Any], ended: EndedError) -> Outcome:
         "expected": "an outcome", "fix": "Mend what ends or stops it.",
     }  # fmt: skip
     return Outcome.of_document({**begun, **told})
+
+
+def make_what_is_shared() -> None:
+    """In a child: make what the first body of any backend waits for and the disk keeps from then on."""
+    from soma_core.rig import load_canonical
+    from soma_core.skeleton.joints import joint_regressor
+
+    with suppress(SomaError):  # told where a backend meets it
+        joint_regressor(*load_canonical("mid"))
 
 
 def check_one(

@@ -80,14 +80,14 @@ def test_harm_costs_one_row_and_the_listing_stays_json(site: Path) -> None:
     ended = _soma(site, "--load", "--json", "--timeout", "30")
     rows = {row["name"]: row for row in json.loads(ended.stdout) if row["state"] != "blocked"}
     assert ended.returncode == 3
-    assert rows["soma"]["state"] == "built"
+    assert rows["soma"]["state"] == "built", rows["soma"]
     assert "damaged" in rows["-"]["error"]["cause"]
     for name, (_, _, told) in HARM.items():
         row = rows[name]
         if told:
             error = row["error"]
-            assert row["state"] == "broken", name
-            assert f"{error['stage']}: {error['cause']}".startswith(told), name
+            assert row["state"] == "broken", row
+            assert f"{error['stage']}: {error['cause']}".startswith(told), row
         else:
             assert row["state"] == "built", row
     assert "from C" in ended.stderr
@@ -128,6 +128,22 @@ def test_a_caller_that_stops_listening_leaves_nothing() -> None:
     assert time.monotonic() - begun < 40
     with pytest.raises(ProcessLookupError):
         os.kill(pid, 0)
+
+
+@pytest.mark.slow
+def test_what_a_child_prepares_is_not_in_the_limit() -> None:
+    """On a busy machine imports and a first compilation took longer than what a plugin was given."""
+    assert list(run_in_child(f"{__name__}:_counts", 2, seconds=5, prepare=f"{__name__}:_takes_6_s")) == [0, 1]
+
+
+def test_a_child_that_never_is_ready_ends(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("soma_core.plugin.child._STARTS_S", 0.1)
+    with pytest.raises(EndedError, match=r"not ready within 0\.1 s"):
+        list(run_in_child(f"{__name__}:_counts", 2, seconds=60, prepare=f"{__name__}:_takes_6_s"))
+
+
+def _takes_6_s() -> None:
+    time.sleep(6)
 
 
 def _counts(say, count: int) -> None:

@@ -33,7 +33,7 @@ def _install(monkeypatch: pytest.MonkeyPatch, *points: FakeEntryPoint) -> Regist
     return registry
 
 
-def _run_here(function: str, *arguments: Any, seconds: float, preload: Any = ()) -> Iterator[Any]:
+def _run_here(function: str, *arguments: Any, seconds: float, **_: Any) -> Iterator[Any]:
     """In place of a child process, in which there would be other registries."""
     said: list[Any] = []
     getattr(backends, function.partition(":")[2])(said.append, *arguments)
