@@ -1,5 +1,6 @@
 """Angles of pose inversion: plain skinning comes back, wrong fits are caught, measures know the truth."""
 
+import shutil
 from dataclasses import replace
 
 import numpy as np
@@ -30,6 +31,7 @@ from soma_core.geometry.rotations import axis_angle_to_matrix
 from soma_core.inversion import PoseInversion
 from soma_core.inversion.priors import HINGES
 from soma_core.layer import SomaLayer
+from soma_core.paths import assets_dir
 
 FRAMES = 2
 GRADIENT = 1e-4
@@ -138,7 +140,21 @@ def test_a_wrong_frame_needs_both_the_flag_and_the_angle():
     assert Fit.joined([fit, fit.part(slice(0, 1))]).wrong == 2
 
 
-def test_noise_outliers_and_gaps():
+def test_noise_of_recorded_motions(monkeypatch, tmp_path):
+    (tmp_path / "motions").mkdir()
+    shutil.copy(assets_dir() / "motions/range_of_motion.npz", tmp_path / "motions/one.npz")
+    monkeypatch.setenv("SOMA_TEST_DATA", str(tmp_path))
+    piece = pose_angle_noise.noisy_targets(plain_layer, FRAMES, 0, "low")
+    rows = {row[0]: row[2] for row in piece.table.rows}
+    assert rows["recorded motions, noise of 5 mm"] == FRAMES
+    found = values(piece)
+    noisy = [found[f"recorded motions, noise of {mm} mm, body joints, mean angle"] for mm in (5, 20)]
+    assert [one.bound for one in noisy] == [2, 6]
+    assert 0.3 < noisy[0].value < noisy[1].value
+
+
+def test_noise_outliers_and_gaps(monkeypatch):
+    monkeypatch.delenv("SOMA_TEST_DATA", raising=False)
     piece = pose_angle_noise.noisy_targets(plain_layer, FRAMES, 0, "low")
     assert [row[0] for row in piece.table.rows] == [
         "noise of 5 mm", "noise of 20 mm", "outliers, robust", "30 % missing",
