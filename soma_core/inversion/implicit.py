@@ -14,7 +14,7 @@ from soma_core.inversion.prior_curvature import Priors
 from soma_core.inversion.problem import Pose, Problem
 from soma_core.inversion.protocol import Curvature, ForwardModel
 
-__all__ = ["attach_gradient"]
+__all__ = ["EXACT", "INDEFINITE", "attach_gradient", "attached", "conjugate_gradients"]
 
 _CHUNK = 64
 """Frames treated at a time."""
@@ -33,10 +33,10 @@ _STEPS, _FINE, _LONGEST = 3, 1e-9, 0.05
 """Newton steps from the fit to the minimum, how near that is as a root mean square over the vertices [m], and
 how far a step may go [rad, m]."""
 
-_EXACT, _FOLDED, _INDEFINITE = 0, 1, 2
+EXACT, _FOLDED, INDEFINITE = 0, 1, 2
 _TROUBLE = {
     _FOLDED: "got the gradient of one side: they rest in a fold of the model, where a corrective sets in",
-    _INDEFINITE: "got no gradient: their error curves downwards where they rest, which is no minimum",
+    INDEFINITE: "got no gradient: their error curves downwards where they rest, which is no minimum",
 }
 
 
@@ -67,32 +67,52 @@ def attach_gradient(
         problem: of a chunk of the frames; no gradient reaches its identity and weights.
         valid: (F,) bool.
     """
-    return _Implicit.apply(vertices, rotations, translation, (model, problem, valid))
+
+    def pulled(*frames: Tensor) -> tuple[Tensor, Tensor]:
+        found = []
+        for first in range(0, len(valid), _CHUNK) or (0,):
+            chunk = slice(first, first + _CHUNK)
+            with torch.autocast(rotations.device.type, enabled=False):
+                own = (one[chunk] for one in (*frames, valid))
+                found.append(_pull_back(model, problem(chunk), *own))
+        grads, states = (torch.cat(parts) for parts in zip(*found, strict=True))
+        return grads, states
+
+    return attached(vertices, rotations, translation, pulled)
+
+
+def attached(
+    target: Tensor,
+    rotations: Tensor,
+    translation: Tensor,
+    pulled: Callable[[Tensor, Tensor, Tensor, Tensor], tuple[Tensor, Tensor]],
+) -> tuple[Tensor, Tensor]:
+    """Rotations and translation of a fit with a derivative by its target.
+
+    Args:
+        target: of the fit.
+        rotations, translation: its minimum.
+        pulled: from the minimum, and derivatives by both of its parts, that by the target, and what each
+            frame is (F,), for a warning.
+    """
+    return _Implicit.apply(target, rotations, translation, pulled)
 
 
 class _Implicit(torch.autograd.Function):
     @staticmethod
     def forward(
-        ctx: Any, _vertices: Tensor, rotations: Tensor, translation: Tensor, parts: Any
+        ctx: Any, _target: Tensor, rotations: Tensor, translation: Tensor, pulled: Any
     ) -> tuple[Tensor, Tensor]:
-        ctx.parts = parts
+        ctx.pulled = pulled
         ctx.save_for_backward(rotations, translation)
         return rotations.clone(), translation.clone()
 
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx: Any, by_rotations: Tensor, by_translation: Tensor) -> tuple[Tensor, None, None, None]:
-        model, problem, valid = ctx.parts
-        frames = *ctx.saved_tensors, by_rotations, by_translation, valid
-        grads, states = [], []
-        for first in range(0, len(valid), _CHUNK) or (0,):
-            chunk = slice(first, first + _CHUNK)
-            with torch.autocast(by_rotations.device.type, enabled=False):
-                moved, state = _pull_back(model, problem(chunk), *(one[chunk] for one in frames))
-            grads.append(moved)
-            states.append(state)
-        _warn(torch.cat(states))
-        return torch.cat(grads), None, None, None
+        grad, states = ctx.pulled(*ctx.saved_tensors, by_rotations, by_translation)
+        _warn(states)
+        return grad, None, None, None
 
 
 def _pull_back(
@@ -111,7 +131,7 @@ def _pull_back(
     slope = _slope(system, by_rotations.double(), by_translation.double())
     motion, good = system.solve(torch.where(valid[:, None, None], slope, 0.0))
     moved = problem.weights[..., None] * system.pulled(motion).to(rotations)
-    state = torch.where(good, torch.where(smooth, _EXACT, _FOLDED), _INDEFINITE)
+    state = torch.where(good, torch.where(smooth, EXACT, _FOLDED), INDEFINITE)
     return torch.where(valid[:, None, None], moved, 0.0), state * valid
 
 
@@ -220,35 +240,64 @@ class _System:
 
     def solve(self, slope: Tensor) -> tuple[Tensor, Tensor]:
         """Motions (F, n + 1, 3) that the matrix maps to slopes, and (F,) whether it is positive there."""
-        left = self.free(slope)
-        motion, good = torch.zeros_like(left), torch.ones(len(left), dtype=torch.bool, device=left.device)
-        way = near = self.free(self.inverse(left))
-        size, enough = _inner(left, near), _ACCURATE**2 * _inner(left, left)
-        moving = size > 0
-        for _ in range(_ROUNDS):
-            if not bool(moving.any()):
-                break
-            bent = self.times(way)
-            curved = _inner(way, bent)
-            good = good & ~(moving & ~(curved > 0))
-            moving = moving & good
-            step = _quotient(size, curved, moving)
-            motion, left = motion + step * way, left - step * bent
-            near = self.free(self.inverse(left))
-            new = _inner(left, near)
-            moving = moving & (_inner(left, left) > enough)
-            way = near + _quotient(new, size, moving) * way
-            size = new
-        return torch.where(good[:, None, None], motion, 0.0), good
+        return conjugate_gradients(
+            self.times, lambda left: self.free(self.inverse(left)), self.free(slope), rounds=_ROUNDS,
+            accurate=_ACCURATE,
+        )  # fmt: skip
 
 
 def _inner(one: Tensor, other: Tensor) -> Tensor:
-    return (one * other).sum((1, 2))
+    return (one * other).flatten(1).sum(1)
 
 
-def _quotient(above: Tensor, below: Tensor, where: Tensor) -> Tensor:
-    """(F, 1, 1), zero elsewhere."""
-    return torch.where(where, above / torch.where(where, below, 1.0), 0.0)[:, None, None]
+def conjugate_gradients(
+    times: Callable[[Tensor], Tensor],
+    inverse: Callable[[Tensor], Tensor],
+    right: Tensor,
+    *,
+    rounds: int,
+    accurate: float,
+    inner: Callable[[Tensor, Tensor], Tensor] = _inner,
+) -> tuple[Tensor, Tensor]:
+    """Vectors (F, ...) that a matrix maps to others, and (F,) whether it is positive there; else zeros.
+
+    Args:
+        times: the matrix times vectors (F, ...).
+        inverse: about that of the matrix.
+        right: (F, ...).
+        rounds: largest number of products with the matrix.
+        accurate: a frame is done when this share of it is left.
+        inner: products (F,) of two vectors; one number for all where their frames are one system.
+    """
+    left, found = right, torch.zeros_like(right)
+    good = torch.ones(len(left), dtype=torch.bool, device=left.device)
+    way = near = inverse(left)
+    size, enough = inner(left, near), accurate**2 * inner(left, left)
+    moving = size > 0
+    for _ in range(rounds):
+        if not bool(moving.any()):
+            break
+        bent = times(way)
+        curved = inner(way, bent)
+        good = good & ~(moving & ~(curved > 0))
+        moving = moving & good
+        step = _quotient(size, curved, moving, left)
+        found, left = found + step * way, left - step * bent
+        near = inverse(left)
+        new = inner(left, near)
+        moving = moving & (inner(left, left) > enough)
+        way = near + _quotient(new, size, moving, left) * way
+        size = new
+    return torch.where(_along(good, found), found, 0.0), good
+
+
+def _quotient(above: Tensor, below: Tensor, where: Tensor, like: Tensor) -> Tensor:
+    """(F, 1, ...), zero elsewhere."""
+    return _along(torch.where(where, above / torch.where(where, below, 1.0), 0.0), like)
+
+
+def _along(values: Tensor, like: Tensor) -> Tensor:
+    return values.view(-1, *[1] * (like.ndim - 1))
 
 
 def _warn(states: Tensor) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -13,11 +13,11 @@ from torch import Tensor
 from soma_core.errors import InputError
 from soma_core.inversion.free_parameters import FreeParameters
 from soma_core.inversion.identity import IdentityFit
+from soma_core.inversion.levenberg import Damping, bounded_step, descend, promising
 from soma_core.inversion.point_model import PointModel
 from soma_core.inversion.point_rows import PointRows, rows_of
 from soma_core.inversion.points import PointInversion
 from soma_core.inversion.problem import Pose, part_of
-from soma_core.inversion.shape_search import bounded_step
 from soma_core.skeleton.identity import Identity
 
 __all__ = ["fit_point_identity"]
@@ -32,8 +32,7 @@ _RIDGE = 1e-6
 _STEP = 0.1
 """Length of the steps that derivatives are taken over, in units of the parameters."""
 
-_LOWER, _RAISE, _TRIES = 0.2, 8.0, 4
-"""Levenberg damping: factors after a good and a bad step; bad steps in a row before the search ends."""
+_DAMPING = Damping(tries=4)
 
 _NOTICEABLE = 1e-3
 """A step that lowers what is minimised by less, relatively, is the last."""
@@ -93,7 +92,9 @@ def fit_point_identity(
     every = None if weights is None else torch.as_tensor(weights)
     some = every[chosen] if every is not None and every.ndim == 2 and len(every) == len(points) else every
     search = _Search(inversion, points[chosen], some, parameters)
-    begun = [search.few().descend(point, _FEW_STEPS)[0] for point in search.starts()]
+    few, spread = search.few(), parameters.spread(_CANDIDATES)
+    starts = promising(parameters, spread, few.errors, _STARTS, at_once=_CANDIDATES)
+    begun = [few.descend(point, _FEW_STEPS)[0] for point in starts]
     best = min(begun, key=lambda state: state.error)
     found, converged = search.descend(best.point, iterations)
     return IdentityFit(
@@ -126,42 +127,38 @@ class _Search:
         given = self.given[some] if apart else self.given
         return _Search(self.inversion, self.points[some], given, self.parameters)
 
-    def starts(self) -> list[np.ndarray]:
-        """The given start, and the best of bodies spread over the bounded parameters."""
-        spread, few = self.parameters.spread(_CANDIDATES), self.few()
-        if not len(spread):
-            return [self.parameters.start]
-        count = len(few.points)
-        bodies = self.parameters.identities(np.repeat(spread, count, 0))
-        given = few.given if few.given is None or few.given.ndim == 1 else few.given.repeat(len(spread), 1)
-        residual = self.inversion(few.points.repeat(len(spread), 1, 1), bodies, weights=given).residual
-        errors = residual.square().nan_to_num(nan=torch.inf).view(len(spread), count).mean(1)
-        order = errors.argsort().tolist()
-        return [self.parameters.start, *(spread[place] for place in order[:_STARTS])]
+    def errors(self, points: np.ndarray) -> np.ndarray:
+        """Mean squared errors (m,) of several bodies, each in its best pose."""
+        count, given = len(self.points), self.given
+        bodies = self.parameters.identities(np.repeat(points, count, 0))
+        given = given if given is None or given.ndim == 1 else given.repeat(len(points), 1)
+        residual = self.inversion(self.points.repeat(len(points), 1, 1), bodies, weights=given).residual
+        squares = residual.square().nan_to_num(nan=torch.inf).view(len(points), count)
+        return squares.mean(1).cpu().numpy()
 
     def descend(self, point: np.ndarray, iterations: int) -> tuple[_State, bool]:
         """Lower what is left from `point`; the second value is whether it came to rest."""
-        state = self._state(point, None)
+        begin = self._noted(self._state(point, None))
+        return descend(
+            begin, self._attempts, lambda trial: self._noted(self._state(trial.point, None)),
+            damping=_DAMPING, iterations=iterations,
+        )  # fmt: skip
+
+    def _attempts(self, state: _State) -> Callable[[float], tuple[_State, bool, bool]]:
+        matrix, slope = self._normal_equations(state)
+        before = self._energy(state, state.noise)
+
+        def attempt(damping: float) -> tuple[_State, bool, bool]:
+            step = bounded_step(self.parameters, state.point, matrix, slope, damping)
+            trial = self._state(step, state.noise)
+            gain = before - trial.energy
+            return trial, gain > 0, gain < _NOTICEABLE * before
+
+        return attempt
+
+    def _noted(self, state: _State) -> _State:
         self.history.append(state.error)
-        damping = 1e-3
-        for _ in range(iterations):
-            matrix, slope = self._normal_equations(state)
-            before = self._energy(state, state.noise)
-            for _ in range(_TRIES):
-                step = bounded_step(self.parameters, state.point, matrix, slope, damping)
-                trial = self._state(step, state.noise)
-                gain = before - trial.energy
-                if gain > 0:
-                    break
-                damping *= _RAISE
-            else:
-                return state, True
-            damping *= _LOWER
-            state = self._state(trial.point, None)
-            self.history.append(state.error)
-            if gain < _NOTICEABLE * before:
-                return state, True
-        return state, False
+        return state
 
     def _state(self, point: np.ndarray, noise: float | None) -> _State:
         identity = self.parameters.identities(point[None])

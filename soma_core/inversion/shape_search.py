@@ -2,22 +2,23 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
-import scipy.optimize
 import torch
 from torch import Tensor
 
 from soma_core.inversion.fit import PoseInversion
 from soma_core.inversion.free_joints import WithJoints
 from soma_core.inversion.free_parameters import FreeParameters
+from soma_core.inversion.levenberg import Bounded, Damping, bounded_step, descend, promising
 from soma_core.inversion.result import InversionResult
 from soma_core.inversion.shape_response import shape_normal_equations
 from soma_core.skeleton.identity import Identity
 
-__all__ = ["Sample", "ShapeFound", "bounded_step", "search_parameters"]
+__all__ = ["Sample", "ShapeFound", "search_parameters"]
 
 _PLAIN, _ROBUST = 1.0, 5e-4
 """Scale of the loss [m]: vertices whose error lies above it count less. The first leaves all alike."""
@@ -35,19 +36,14 @@ _STEP = 0.1
 _PRIOR = 1e-5
 """Weight of a parameter's square, relative to the mean squared error: decides what the frames do not."""
 
-_LOWER, _RAISE, _TRIES = 0.2, 8.0, 5
-"""Levenberg damping: factors after a good and a bad step; bad steps in a row before the search ends."""
+_DAMPING = Damping(tries=5)
 
 _NOTICEABLE = 3e-4
 """A step that lowers the error by less, relatively, is the last."""
 
 
-class Unknowns(Protocol):
+class Unknowns(Bounded, Protocol):
     """What a search moves in: :class:`FreeParameters`, or those :class:`WithJoints`."""
-
-    start: np.ndarray
-    lower: np.ndarray
-    upper: np.ndarray
 
     def identities(self, points: np.ndarray) -> Identity:
         """Identities of (m, k) points."""
@@ -133,7 +129,9 @@ def search_parameters(
     bending from shape: there the parameters are all that is sought.
     """
     few = _Search(inversion, sample.some(_FEW_FRAMES), parameters)
-    found = [few.descend(point, _PLAIN, min(iterations, _FEW_STEPS))[0] for point in _starts(few, parameters)]
+    spread = parameters.spread(_CANDIDATES)
+    starts = promising(parameters, spread, few.errors, _STARTS - 1, at_once=_AT_A_TIME)
+    found = [few.descend(point, _PLAIN, min(iterations, _FEW_STEPS))[0] for point in starts]
     best = min(found, key=lambda state: float(few.sample.mean(state.squares)))
     count, moving = len(best.point), len(sample.vertices) > 1
     unknowns = WithJoints(parameters, inversion.layer) if moving else parameters
@@ -144,14 +142,6 @@ def search_parameters(
         point = state.point
     identity = parameters.identities(point[None, :count])
     return ShapeFound(identity=identity, history=tuple(whole.history), converged=converged)
-
-
-def _starts(search: _Search, parameters: FreeParameters) -> list[np.ndarray]:
-    """The given start, and the best of bodies spread over the bounded parameters."""
-    spread = parameters.spread(_CANDIDATES)
-    errors = [search.errors(spread[k : k + _AT_A_TIME]) for k in range(0, len(spread), _AT_A_TIME)]
-    order = np.argsort(np.concatenate((np.zeros(0), *errors)))
-    return [parameters.start, *spread[order[: _STARTS - 1]]]
 
 
 class _Search:
@@ -174,32 +164,28 @@ class _Search:
 
     def descend(self, point: np.ndarray, scale: float, iterations: int) -> tuple[_State, bool]:
         """Lower the error from `point`; the second value is whether it came to rest."""
-        trust = torch.ones_like(self.sample.weights[0])
-        state = self._state(point, trust)
-        self._note(state)
-        damping = 1e-3
-        for _ in range(iterations):
-            trust = (scale**2 / (scale**2 + state.squares)).to(trust)
-            prior = _PRIOR * float(self._loss(state, scale))
-            matrix, slope = self._normal_equations(state, trust, prior)
-            before = self._objective(state, scale, prior)
-            for _ in range(_TRIES):
-                trial = self._state(bounded_step(self.unknowns, state.point, matrix, slope, damping), trust)
-                gain = before - self._objective(trial, scale, prior)
-                if gain > 0:
-                    break
-                damping *= _RAISE
-            else:
-                return state, True
-            damping *= _LOWER
-            state = trial
-            self._note(state)
-            if gain < _NOTICEABLE * before:
-                return state, True
-        return state, False
+        begin = self._noted(self._state(point, torch.ones_like(self.sample.weights[0])))
+        return descend(
+            begin, lambda state: self._attempts(state, scale), self._noted, damping=_DAMPING,
+            iterations=iterations,
+        )  # fmt: skip
 
-    def _note(self, state: _State) -> None:
+    def _attempts(self, state: _State, scale: float) -> Callable[[float], tuple[_State, bool, bool]]:
+        trust = (scale**2 / (scale**2 + state.squares)).to(self.sample.weights)
+        prior = _PRIOR * float(self._loss(state, scale))
+        matrix, slope = self._normal_equations(state, trust, prior)
+        before = self._objective(state, scale, prior)
+
+        def attempt(damping: float) -> tuple[_State, bool, bool]:
+            trial = self._state(bounded_step(self.unknowns, state.point, matrix, slope, damping), trust)
+            gain = before - self._objective(trial, scale, prior)
+            return trial, gain > 0, gain < _NOTICEABLE * before
+
+        return attempt
+
+    def _noted(self, state: _State) -> _State:
         self.history.append(float(self.sample.mean(state.squares).sqrt()))
+        return state
 
     def _state(self, point: np.ndarray, trust: Tensor) -> _State:
         identity = self.unknowns.identities(point[None])
@@ -227,14 +213,3 @@ class _Search:
         total = float(self.sample.weights.expand(len(self.sample.vertices), -1).double().sum())
         matrix, slope = left.cpu().numpy() / total, right.cpu().numpy() / total
         return matrix + prior * np.eye(len(slope)), slope + prior * state.point
-
-
-def bounded_step(
-    unknowns: Unknowns, point: np.ndarray, matrix: np.ndarray, slope: np.ndarray, damping: float
-) -> np.ndarray:
-    """The minimum of the damped quadratic inside the bounds."""
-    damped = matrix + damping * np.diag(np.diag(matrix))
-    factor = np.linalg.cholesky(damped)
-    goal = scipy.linalg.solve_triangular(factor, -slope, lower=True)
-    bounds = unknowns.lower - point, unknowns.upper - point
-    return point + scipy.optimize.lsq_linear(factor.T, goal, bounds, method="bvls").x

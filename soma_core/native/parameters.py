@@ -8,7 +8,7 @@ slopes by differences.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
@@ -16,6 +16,7 @@ from torch import Tensor
 
 from soma_core.backends.parameters import batch_parameters
 from soma_core.errors import InputError
+from soma_core.inversion.levenberg import Damping, descend
 from soma_core.native.transfer import NativeTransfer
 from soma_core.plugin.declaration import refuse_posed
 from soma_core.plugin.registry import Registry, default_registry
@@ -38,8 +39,7 @@ _RIDGE = 1e-6
 """A parameter away from its start by one costs as much as this mean square error [m^2], a millimetre: that
 decides what no vertex tells."""
 
-_TRIES, _CALM, _BOLD = 6, 3.0, 4.0
-"""Attempts at a step, and by how much the damping falls after a good one and rises after a bad one."""
+_DAMPING = Damping(tries=6, lower=1 / 3, higher=4.0)
 
 _GOOD, _LIKE = 2e-3, 1.2
 """A frame is tried from the rest pose too where it is not met this well, as a root mean square [m], nor about
@@ -133,11 +133,7 @@ class ParameterFit:
         rest = torch.zeros(self.generator.pose_size, device=self.device, dtype=self.dtype)
         found, last = [], None
         for frame, usable in zip(target[:, self._points], valid.tolist(), strict=True):
-            row = (
-                _Fitted(rest, torch.inf, converged=False, steps=0)
-                if not usable
-                else self._frame(body, frame, last)
-            )
+            row = _Fitted(rest, rest, torch.inf) if not usable else self._frame(body, frame, last)
             last = row if usable else last
             found.append(row)
         parameters = torch.stack([row.point for row in found])
@@ -231,46 +227,34 @@ class ParameterFit:
     ) -> _Fitted:
         """Least squares from `start`: points to `target`, and parameters to `around` where nothing tells."""
         free = torch.arange(len(start), device=self.device) if free is None else free
-        point, damping, accepted, converged = start, 1e-3, 0, False
-        shown = self._seen(inputs, point[None])[0]
         weight = _RIDGE * torch.ones(len(free), dtype=torch.float64, device=self.device)
 
-        def cost(shown: Tensor, point: Tensor) -> float:
+        def state(point: Tensor, steps: int) -> _Fitted:
+            shown = self._seen(inputs, point[None])[0]
             away = (point - around)[free].double()
-            return float((shown - target).double().square().sum(-1).mean() + (weight * away.square()).sum())
+            squares = (shown - target).double().square().sum(-1).mean() + (weight * away.square()).sum()
+            return _Fitted(point, shown, float(squares), steps=steps)
 
-        error = cost(shown, point)
-        for _ in range(self._iterations):
-            slope = self._slopes(inputs, point, shown, steps, free)
-            residual = (shown - target).double().flatten()
+        def attempts(now: _Fitted) -> Callable[[float], tuple[_Fitted, bool, bool]]:
+            slope = self._slopes(inputs, now.point, now.shown, steps, free)
+            residual = (now.shown - target).double().flatten()
             matrix = slope.T @ slope / len(target) + torch.diag(weight)
-            right = slope.T @ residual / len(target) + weight * (point - around)[free].double()
-            for _ in range(_TRIES):
+            right = slope.T @ residual / len(target) + weight * (now.point - around)[free].double()
+
+            def attempt(damping: float) -> tuple[_Fitted, bool, bool]:
                 damped = matrix + damping * torch.diag(matrix.diagonal())
                 move = -torch.cholesky_solve(right[:, None], torch.linalg.cholesky(damped))[:, 0]
-                trial = point.clone()
-                trial[free] += move.to(point)
-                trial_shown = self._seen(inputs, trial[None])[0]
-                trial_error = cost(trial_shown, trial)
-                if trial_error < error:
-                    break
-                damping *= _BOLD
-            else:
-                converged = True
-                break
-            change = float((trial_shown - shown).square().sum(-1).mean().sqrt())
-            point, shown, error, accepted, damping = (
-                trial,
-                trial_shown,
-                trial_error,
-                accepted + 1,
-                damping / _CALM,
-            )
-            if change < self._tolerance:
-                converged = True
-                break
-        rms = float((shown - target).square().sum(-1).mean().sqrt())
-        return _Fitted(point, rms, converged=converged, steps=accepted)
+                point = now.point.clone()
+                point[free] += move.to(point)
+                trial = state(point, now.steps + 1)
+                change = float((trial.shown - now.shown).square().sum(-1).mean().sqrt())
+                return trial, trial.cost < now.cost, change < self._tolerance
+
+            return attempt
+
+        found, rests = descend(state(start, 0), attempts, damping=_DAMPING, iterations=self._iterations)
+        rms = float((found.shown - target).square().sum(-1).mean().sqrt())
+        return replace(found, error=rms, converged=rests)
 
     def _slopes(self, inputs: _Inputs, point: Tensor, shown: Tensor, steps: Tensor, free: Tensor) -> Tensor:
         """What each free parameter does to the points, (3 m, k) float64 [m]."""
@@ -300,9 +284,11 @@ _Inputs = Callable[[Tensor], tuple[Mapping[str, Tensor], Tensor]]
 
 @dataclass(frozen=True, eq=False)
 class _Fitted:
-    """Where a descent ended: the unknowns, the root mean square error [m], and how it went."""
+    """Where a descent is: its unknowns, points and cost [m^2]; in the end the error [m], and how it went."""
 
     point: Tensor
-    error: float
-    converged: bool
-    steps: int
+    shown: Tensor
+    cost: float
+    error: float = float("inf")
+    converged: bool = False
+    steps: int = 0

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
+from soma_core.inversion.levenberg import Damping, descend
 from soma_core.inversion.problem import Pose
 from soma_core.native.poses import PoseFit
 from soma_core.skeleton.identity import Identity
@@ -44,24 +46,33 @@ def fit_shape(
         target: (F, n, 3) [m], finite.
         iterations: largest number of steps.
     """
-    point, fit = start, prepare(start)
-    pose = fit(target)
-    error = _error(fit, pose, target, point - start)
-    for _ in range(iterations):
-        step = _step(fit, directions(point), pose, target, point - start)
-        before = error
-        for _ in range(_HALVINGS):
-            trial = point + step
-            fitted = prepare(trial)
-            trial_pose = fitted(target)
-            trial_error = _error(fitted, trial_pose, target, trial - start)
-            if trial_error < error:
-                point, fit, pose, error = trial, fitted, trial_pose, trial_error
-                break
-            step = 0.5 * step
-        if error > (1 - _RESTING) * before:
-            break
-    return point
+
+    def state(point: Tensor) -> _State:
+        fit = prepare(point)
+        pose = fit(target)
+        return _State(point=point, fit=fit, pose=pose, error=_error(fit, pose, target, point - start))
+
+    def attempts(now: _State) -> Callable[[float], tuple[_State, bool, bool]]:
+        step = 2 * _step(now.fit, directions(now.point), now.pose, target, now.point - start)
+
+        def attempt(_damping: float) -> tuple[_State, bool, bool]:
+            step.mul_(0.5)
+            trial = state(now.point + step)
+            return trial, trial.error < now.error, trial.error > (1 - _RESTING) * now.error
+
+        return attempt
+
+    return descend(state(start), attempts, damping=Damping(tries=_HALVINGS), iterations=iterations)[0].point
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _State:
+    """A body under way, its frames in their best poses."""
+
+    point: Tensor
+    fit: PoseFit
+    pose: Pose
+    error: float
 
 
 def _error(fit: PoseFit, pose: Pose, target: Tensor, away: Tensor) -> float:
