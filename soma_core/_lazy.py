@@ -35,15 +35,15 @@ def lazy_names(
     return load, lambda: sorted({*vars(here), *here.__all__})
 
 
-def needed(package: str, *parts: str, setting: str, extra: str, otherwise: str = "") -> Any:
-    """A package that an extra installs, with those of its modules that are named.
+def needed(package: str, *parts: str, setting: object, pip: str, otherwise: str = "") -> Any:
+    """A package that is not always installed, with those of its modules that are named.
 
     Args:
         package: its name.
         parts: modules below it, ``data`` of ``ray``.
         setting: what asked for it.
-        extra: of ``soma-body-core``.
-        otherwise: what to do instead.
+        pip: what to install: an extra of ours in brackets, ``[ray]``, or a package.
+        otherwise: what to do instead, after a semicolon.
 
     Raises:
         InputError: it is not installed.
@@ -53,5 +53,8 @@ def needed(package: str, *parts: str, setting: str, extra: str, otherwise: str =
             importlib.import_module(f"{package}.{name}")
         return importlib.import_module(package)
     except ImportError as error:
-        fix = f"Run: pip install 'soma-body-core[{extra}]'{otherwise}."
-        raise InputError(setting, got=f"no {package}", expected=f"{package} installed", fix=fix) from error
+        wheel = f"'soma-body-core{pip}'" if pip.startswith("[") else pip
+        fix = f"Run: pip install {wheel}{otherwise and '; or '}{otherwise}."
+        raise InputError(
+            str(setting), got=f"no {package}", expected=f"{package} installed", fix=fix
+        ) from error

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import importlib
 import json
 import logging
 import warnings
@@ -14,38 +13,32 @@ from typing import Any
 import numpy as np
 import torch
 
+from soma_core._lazy import needed
 from soma_core.cache import atomic_write
 from soma_core.deploy.program import DeployedModel
-from soma_core.errors import SomaError
 
-__all__ = ["OPSET", "needed", "open_session", "run_session", "write_onnx", "write_program"]
+__all__ = ["OPSET", "need_onnx", "open_session", "run_session", "write_onnx", "write_program"]
 
 OPSET = 18
 """Version of ONNX's operators that files are written in."""
 
 
-def needed(name: str) -> Any:
-    """Import a package of the extra ``onnx``.
+def need_onnx(package: str, *parts: str) -> Any:
+    """A package of the extra ``onnx``, with those of its modules that are named.
 
     Raises:
-        SomaError: it is not installed.
+        InputError: it is not installed.
     """
-    try:
-        return importlib.import_module(name)
-    except ImportError as error:
-        raise SomaError(
-            f"ONNX files need {name}, which is not installed. Run: pip install 'soma-body-core[onnx]', or "
-            "write the torch.export program alone: write=[pt2]."
-        ) from error
+    return needed(package, *parts, setting="write", pip="[onnx]", otherwise="pass write=[pt2]")
 
 
 def write_onnx(path: Path, model: DeployedModel) -> None:
     """Write an ONNX file with named inputs and outputs, an open batch, and what there is to know as metadata.
 
     Raises:
-        SomaError: the extra ``onnx`` is not installed.
+        InputError: the extra ``onnx`` is not installed.
     """
-    needed("onnxscript")
+    optimizer = need_onnx("onnxscript", "optimizer").optimizer
     with warnings.catch_warnings(), _quiet("torch.onnx"):
         warnings.simplefilter("ignore")  # of torch, about its own use of pytree (2.13)
         made = torch.onnx.export(
@@ -53,7 +46,6 @@ def write_onnx(path: Path, model: DeployedModel) -> None:
             input_names=[*model.inputs], output_names=[*model.outputs],
         )  # fmt: skip
     assert made is not None
-    optimizer = needed("onnxscript.optimizer")
     optimizer.fold_constants(made.model)
     optimizer.remove_unused_nodes(made.model)  # its whole optimizer takes minutes for some thousand nodes
     graph = made.model.graph
@@ -95,9 +87,9 @@ def open_session(path: Path, *, threads: int = 1) -> Any:
     """An ``onnxruntime.InferenceSession`` on the CPU.
 
     Raises:
-        SomaError: onnxruntime is not installed.
+        InputError: onnxruntime is not installed.
     """
-    runtime = needed("onnxruntime")
+    runtime = need_onnx("onnxruntime")
     options = runtime.SessionOptions()
     options.intra_op_num_threads = options.inter_op_num_threads = threads
     return runtime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])

@@ -6,7 +6,7 @@ from typing import Any
 
 import torch
 
-from soma_core.errors import InputError
+from soma_core._lazy import needed
 
 __all__ = ["anny_package_model"]
 
@@ -21,14 +21,6 @@ def anny_package_model(*, rig: str, topology: str, dtype: torch.dtype) -> Any:
     Raises:
         InputError: the anny package is not installed.
     """
-    try:
-        import anny
-    except ImportError as error:
-        raise InputError(
-            "experiment.backend",
-            got="no anny package",
-            expected="the anny package",
-            fix="pip install anny==0.6.2",
-        ) from error
+    anny = needed("anny", setting="experiment.backend", pip="anny==0.6.2")
     options = {"phenotypes": "all", "pose_parameterization": "local-ref"}
     return anny.Anny(rig=rig, topology=topology, **options).to(dtype)

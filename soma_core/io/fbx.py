@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import io
 import json
 import logging
@@ -11,8 +10,9 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from soma_core._lazy import needed
 from soma_core.apart import read_apart
-from soma_core.errors import AssetError, InputError, SomaError
+from soma_core.errors import AssetError, SomaError
 from soma_core.io.skeleton_motion import SkeletonMotion, skeleton_of_worlds
 from soma_core.io.skeleton_scenes import DAMAGE, among, by_depth, joints_under
 
@@ -41,11 +41,7 @@ def read_fbx(path: Path, *, fps: float | None = None, root: str | None = None) -
         InputError: ufbx is not installed; several skeletons.
         AssetError: damaged, or without bones.
     """
-    if importlib.util.find_spec("ufbx") is None:
-        raise InputError(
-            str(path), got="an FBX file", expected="the package ufbx, which reads it",
-            fix=f"pip install 'soma-body-core[fbx]'. Or: {_BLENDER}",
-        )  # fmt: skip
+    needed("ufbx", setting=path, pip="[fbx]", otherwise=_BLENDER.rstrip("."))
     size = path.stat().st_size
     found = read_apart(
         "soma_core.fbx_probe", path, fps,

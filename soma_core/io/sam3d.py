@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
+from soma_core._lazy import needed
 from soma_core.errors import AssetError, InputError
 from soma_core.files import refuse_unreadable
 from soma_core.io.npz_fields import NpzFields, open_npz
@@ -134,18 +135,9 @@ def _frames(fields: NpzFields, key: str) -> np.ndarray:
 
 def _read_parquet(path: Path) -> dict[str, np.ndarray]:
     refuse_unreadable(path, fix="Give a complete .parquet file.")
+    pa = needed("pyarrow", "parquet", setting=path, pip="[parquet]")
     try:
-        import pyarrow as pa
-        from pyarrow import parquet
-    except ImportError as error:
-        raise InputError(
-            str(path),
-            got="a .parquet without pyarrow installed",
-            expected="pyarrow, which reads it",
-            fix="Run: pip install pyarrow",
-        ) from error
-    try:
-        with parquet.ParquetFile(path) as file:
+        with pa.parquet.ParquetFile(path) as file:
             names, rows = file.schema_arrow.names, file.metadata.num_rows
             wanted = [key for key in _LAYOUT if key in names]
             _refuse_bomb(path, rows, wanted)

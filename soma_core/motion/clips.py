@@ -46,7 +46,7 @@ _FIGURES = ("mean", "median", "p95", "max")
 
 def need_pyarrow() -> Any:
     """The module ``pyarrow``, or an InputError that says how to install it."""
-    return needed("pyarrow", "compute", "parquet", setting="output", extra="parquet")
+    return needed("pyarrow", "compute", "parquet", setting="output", pip="[parquet]")
 
 
 @functools.cache

@@ -186,7 +186,7 @@ def _one_thread() -> Iterator[None]:
 
 def need_ray() -> Any:
     """The module ``ray``, or an InputError that says how to install it."""
-    return needed("ray", "data", setting="engine", extra="ray", otherwise="; or pass engine=local")
+    return needed("ray", "data", setting="engine", pip="[ray]", otherwise="pass engine=local")
 
 
 def pool_settings(options: DatasetOptions) -> Mapping[str, Any]:

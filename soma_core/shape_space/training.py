@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from soma_core._lazy import needed
 from soma_core.cache import atomic_arrays
 from soma_core.errors import InputError
 from soma_core.shape_space.sampling import TRAINING, IdentityStream
@@ -118,10 +119,9 @@ def train_components(
         resume: go on from `state` where it fits; the result equals that of an uninterrupted run.
         progress: shows the steps of an iterable, the number of those done before being given.
     """
-    from sklearn.decomposition import IncrementalPCA
-
+    sklearn = needed("sklearn", "decomposition", setting="task train-shape", pip="[train]")
     rows = plan.batch_sizes[0] * (2 if plan.mirror else 1)
-    pca = IncrementalPCA(min(plan.components + _EXTRA_COMPONENTS, rows, bind.size))
+    pca = sklearn.decomposition.IncrementalPCA(min(plan.components + _EXTRA_COMPONENTS, rows, bind.size))
     done = _restore(pca, state, key) if resume else 0
     sizes = plan.batch_sizes
     for number in progress(range(done, len(sizes)), done):

@@ -15,7 +15,7 @@ from omegaconf import OmegaConf
 
 from soma_core.cache import atomic_text
 from soma_core.choices import ModelFile, ModelPart
-from soma_core.deploy.onnx_file import needed, open_session, run_session, write_onnx, write_program
+from soma_core.deploy.onnx_file import need_onnx, open_session, run_session, write_onnx, write_program
 from soma_core.deploy.program import DeployedModel, deploy
 from soma_core.errors import InputError, SomaError
 from soma_core.evaluation.random_poses import random_axis_angles
@@ -52,7 +52,7 @@ def run(config: DictConfig, output: Path) -> None:
         raise InputError("write", got="none", expected="onnx, pt2 or both", fix="Leave it out.")
     if ModelFile.onnx in options.write:
         for name in ("onnxscript", "onnxruntime"):
-            needed(name)
+            need_onnx(name)
     layer = SomaLayer(
         options.backend.name, options=options.backend.options, lod=options.lod.value,
         procedural=options.procedural, correctives=options.correctives,

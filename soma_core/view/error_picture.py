@@ -49,7 +49,7 @@ def error_sheet(
         width: width of the picture in pixels.
 
     Raises:
-        SomaError: pyvista is not installed.
+        InputError: pyvista is not installed.
     """
     top = scale_top(np.concatenate(errors_mm))
     shaded = [

@@ -27,7 +27,7 @@ def draw_landmarks(path: Path) -> None:
     """Write a PNG: head, body, left hand and foot, each with the points of it that are seen from there.
 
     Raises:
-        SomaError: pyvista is not installed.
+        InputError: pyvista is not installed.
     """
     points = load_canonical("mid")[0].vertices
     at = {name: points[number] for name, number in canonical_landmarks().items()}

@@ -64,7 +64,7 @@ def contact_sheet(
         legend: a picture of the same width to put below.
 
     Raises:
-        SomaError: pyvista is not installed.
+        InputError: pyvista is not installed.
     """
     columns = min(columns, len(bodies))
     boxes = np.array([[body.vertices.min(axis=0), body.vertices.max(axis=0)] for body in bodies])
@@ -122,7 +122,7 @@ def gallery(path: Path, bodies: Sequence[Body], *, width: int = 1600, columns: i
         columns: at most so many bodies in a row; rows are filled evenly.
 
     Raises:
-        SomaError: pyvista is not installed.
+        InputError: pyvista is not installed.
     """
     columns = math.ceil(len(bodies) / math.ceil(len(bodies) / columns))
     top = max(float(body.vertices[:, 1].max()) for body in bodies) * 1.14

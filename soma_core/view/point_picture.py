@@ -52,7 +52,7 @@ def point_picture(
         bones: pairs of names that a line joins.
 
     Raises:
-        SomaError: pyvista is not installed.
+        InputError: pyvista is not installed.
     """
     from PIL import Image
 

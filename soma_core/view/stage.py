@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import scipy.ndimage
 
-from soma_core.errors import SomaError
+from soma_core._lazy import needed
 from soma_core.geometry.mesh import vertex_normals
 
 if TYPE_CHECKING:
@@ -70,15 +70,9 @@ def open_stage(size: tuple[int, int], *, oversampling: int = 3) -> Iterator[Stag
         oversampling: pixels that are drawn for each, along a side.
 
     Raises:
-        SomaError: pyvista is not installed.
+        InputError: pyvista is not installed.
     """
-    try:
-        import pyvista
-    except ImportError as error:
-        raise SomaError(
-            "pictures need pyvista, which is not installed. Run: pip install 'soma-body-core[render]' "
-            "(or leave png out of write=[...])."
-        ) from error
+    pyvista = needed("pyvista", setting="write", pip="[render]", otherwise="leave png out of it")
     with quiet_display():
         stage = Stage(pyvista, size, oversampling)
     try:

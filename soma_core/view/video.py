@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import scipy.ndimage
 
+from soma_core._lazy import needed
 from soma_core.cache import atomic_write
 from soma_core.errors import SomaError
 from soma_core.progress import progress
@@ -92,16 +93,10 @@ def _ffmpeg() -> str:
     """Where the program is.
 
     Raises:
-        SomaError: imageio-ffmpeg is not installed.
+        InputError: imageio-ffmpeg is not installed.
     """
-    try:
-        import imageio_ffmpeg
-    except ImportError as error:
-        raise SomaError(
-            "videos need imageio-ffmpeg, which is not installed. Run: pip install 'soma-body-core[video]' "
-            "(or leave mp4 and gif out of write=[...])."
-        ) from error
-    return str(imageio_ffmpeg.get_ffmpeg_exe())
+    ffmpeg = needed("imageio_ffmpeg", setting="write", pip="[video]", otherwise="leave out mp4 and gif")
+    return str(ffmpeg.get_ffmpeg_exe())
 
 
 def _encode(

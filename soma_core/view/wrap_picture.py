@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from scipy.spatial import cKDTree
 
+from soma_core._lazy import needed
 from soma_core.cache import atomic_write
-from soma_core.errors import SomaError
 from soma_core.geometry.mesh import vertex_normals
 from soma_core.registration.digits import digit_guide
 from soma_core.registration.quality import Quality
@@ -51,7 +51,7 @@ def draw_wrap(path: Path, found: Registration, quality: Quality, mesh: Canonical
     """Write the picture of a registration.
 
     Raises:
-        SomaError: pyvista is not installed.
+        InputError: pyvista is not installed.
     """
     scene = _Scene(found, quality, mesh)
     rows = [scene.far(), scene.near(), scene.hands()]
@@ -60,14 +60,7 @@ def draw_wrap(path: Path, found: Registration, quality: Quality, mesh: Canonical
 
 
 def _pyvista() -> Any:
-    try:
-        import pyvista
-    except ImportError as error:
-        raise SomaError(
-            "pictures need pyvista, which is not installed. Run: pip install 'soma-body-core[render]' "
-            "(or pass picture=false)."
-        ) from error
-    return pyvista
+    return needed("pyvista", setting="picture", pip="[render]", otherwise="pass picture=false")
 
 
 def shot(actors: Sequence[tuple[Any, dict[str, Any]] | None], view: View) -> Image:

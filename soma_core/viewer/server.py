@@ -9,7 +9,8 @@ import logging
 import socket
 from typing import TYPE_CHECKING, Any
 
-from soma_core.errors import InputError, SomaError
+from soma_core._lazy import needed
+from soma_core.errors import InputError
 
 if TYPE_CHECKING:
     from soma_core.viewer.page import Page
@@ -25,15 +26,9 @@ def open_server(host: str, port: int) -> Any:
     """Start viser at an address, or at the next port that is free.
 
     Raises:
-        SomaError: viser is not installed.
-        InputError: no such address of this machine, or none of the ports is free.
+        InputError: viser is not installed; no such address of this machine, or none of the ports is free.
     """
-    try:
-        import viser
-    except ImportError as error:
-        raise SomaError(
-            "soma view needs viser, which is not installed. Run: pip install 'soma-body-core[view]'."
-        ) from error
+    viser = needed("viser", setting="soma view", pip="[view]")
     found = _free_port(host, port)
     if found != port and port:
         _log.info("port %d is taken; this is the next", port)

@@ -117,7 +117,7 @@ def test_what_cannot_be_deployed_is_named(layer, tmp_path, monkeypatch):
 
 def test_a_missing_package_is_named(layer, tmp_path, monkeypatch):
     monkeypatch.setitem(__import__("sys").modules, "onnxscript", None)
-    with pytest.raises(SomaError, match=r"need onnxscript.*pip install 'soma-body-core\[onnx\]'"):
+    with pytest.raises(SomaError, match=r"got no onnxscript.*pip install 'soma-body-core\[onnx\]'"):
         write_onnx(tmp_path / "model.onnx", deploy(layer, ModelPart.joints))
     assert not list(tmp_path.iterdir())
 

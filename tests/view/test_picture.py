@@ -95,7 +95,7 @@ def test_gallery_fills_its_rows_evenly(pyvista, tmp_path):
 
 def test_missing_pyvista_is_named_with_the_pip_line(monkeypatch, tmp_path):
     monkeypatch.setitem(sys.modules, "pyvista", None)
-    with pytest.raises(SomaError, match=r"need pyvista.*pip install 'soma-body-core\[render\]'"):
+    with pytest.raises(SomaError, match=r"got no pyvista.*pip install 'soma-body-core\[render\]'"):
         gallery(tmp_path / "gallery.png", [box(1, 1, (1, 0, 0))])
     assert not list(tmp_path.iterdir())
 
