@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -124,18 +124,14 @@ def animate(
 
 
 def standing_motion(
-    layer: SomaLayer,
-    identity: Identity,
-    motion: Motion,
-    *,
-    translation: str = "ground",
-    ground: str | None = None,
-    contacts: str = "free",
+    layer: SomaLayer, identity: Identity, motion: Motion, placing: Mapping[str, Any]
 ) -> Motion:
-    """The motion that :func:`animate` gives; no frame is posed where it only keeps the recorded path."""
-    choice = _ground_choice(translation, ground, contacts)
-    if (translation, choice, contacts) != ("motion", "none", "free"):
-        placing = {"translation": translation, "ground": ground, "contacts": contacts}
+    """The motion that :func:`animate` gives with the arguments of `placing`.
+
+    No frame is posed where it only keeps the recorded path.
+    """
+    chosen = {"translation": "ground", "ground": None, "contacts": "free", **placing}
+    if (chosen["translation"], _ground_choice(**chosen), chosen["contacts"]) != ("motion", "none", "free"):
         return animate(layer, identity, motion, **placing).motion
     _say_rig(layer, motion)
     return replace(motion, rig_revision=layer.rig.revision, skeleton=skeleton_of(layer.rig, identity))

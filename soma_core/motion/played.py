@@ -7,7 +7,7 @@ import logging
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 import torch
@@ -15,6 +15,7 @@ from torch import Tensor
 
 from soma_core.animation.engine import Body
 from soma_core.animation.kinematics import relative_from_absolute
+from soma_core.choices import Contacts, Ground, Translation
 from soma_core.correctives.shapes import CorrectiveShapes, corrective_shapes
 from soma_core.errors import InputError
 from soma_core.io.clip import SkinnedClip, skinned_clip, t_pose_world
@@ -25,7 +26,6 @@ from soma_core.layer import SomaLayer
 from soma_core.motion.animated import standing_motion
 from soma_core.motion.identities import stored_identity
 from soma_core.motion.models import open_layer
-from soma_core.motion.options import ConvertOptions
 from soma_core.options import BackendChoice, ModelOptions
 from soma_core.skeleton.identity import Identity
 from soma_core.topology.frames import native_to_canonical
@@ -148,7 +148,15 @@ class Played:
         return JointPiece(shown[..., 3], shown[..., :3])
 
 
-def placing_of(options: ConvertOptions) -> dict[str, str]:
+class Placed(Protocol):
+    """Options that tell where a body is to stand."""
+
+    translation: Translation
+    ground: Ground | None
+    contacts: Contacts
+
+
+def placing_of(options: Placed) -> dict[str, str]:
     """Where a body is to stand: arguments of ``animate``, as far as they are not the usual ones."""
     chosen = {"translation": options.translation, "ground": options.ground, "contacts": options.contacts}
     usual = {"ground": None, "contacts": "free"}
@@ -204,5 +212,5 @@ class MovingBodies:
         """The motion on that body, where it is to stand."""
         with torch.no_grad():
             identity = stored_identity(layer, stored)
-            motion = standing_motion(layer, identity, motion, **self._placing)
+            motion = standing_motion(layer, identity, motion, self._placing)
         return Played(layer=layer, identity=identity, motion=replace(motion, identity=stored))

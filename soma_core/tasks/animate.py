@@ -15,7 +15,7 @@ from soma_core.motion.animated import standing_motion
 from soma_core.motion.conversion import load_clip
 from soma_core.motion.identities import backend_of, stored_identity
 from soma_core.motion.models import open_layer
-from soma_core.motion.played import Played
+from soma_core.motion.played import Played, placing_of
 from soma_core.motion.products import write_products
 from soma_core.motion.questions import of_params, say
 from soma_core.motion.writers import WRITERS
@@ -70,10 +70,7 @@ def run(config: DictConfig, output: Path) -> None:
     )
     with torch.no_grad():
         identity = stored_identity(layer, stored)
-        placed = standing_motion(
-            layer, identity, motion, translation=options.translation, ground=options.ground,
-            contacts=options.contacts,
-        )  # fmt: skip
+        placed = standing_motion(layer, identity, motion, placing_of(options))
     played = Played(layer=layer, identity=identity, motion=replace(placed, identity=stored))
     written = write_products(
         played, options.write, lambda product: output / WRITERS[product].file,
