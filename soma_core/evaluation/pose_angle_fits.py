@@ -14,7 +14,7 @@ from torch import Tensor
 from soma_core.evaluation.joint_turns import angles_between
 from soma_core.evaluation.pose_angle_meshes import BODIES, TestBody, drifting_hips, rotation_matrices
 from soma_core.evaluation.report import Figure, Table
-from soma_core.evaluation.shipped_layers import LayerMaker
+from soma_core.evaluation.shipped_layers import LayerMaker, plain_layer
 from soma_core.inversion import InversionResult, PoseInversion
 from soma_core.inversion.fit import Topology
 from soma_core.layer import SomaLayer
@@ -22,8 +22,8 @@ from soma_core.rig.mesh import Lod
 from soma_core.skeleton.identity import Identity
 
 __all__ = [
-    "COLUMNS", "Fit", "InversionMaker", "Piece", "each_body", "finger_joints",
-    "fit_frames", "own_fit", "posed_vertices", "visible_joints",
+    "COLUMNS", "Fit", "InversionMaker", "Piece", "Trial", "finger_joints",
+    "fit_frames", "own_fit", "piece", "posed_vertices", "visible_joints",
 ]  # fmt: skip
 
 InversionMaker = Callable[..., PoseInversion]
@@ -204,21 +204,62 @@ def posed_vertices(layer: SomaLayer, identity: Identity, rotations: Tensor, hips
     return torch.cat([layer.pose(identity, turn, place).vertices for turn, place in chunks])
 
 
-def each_body(
-    make: LayerMaker,
-    lod: Lod,
-    invert: InversionMaker,
-    device: str,
-    bodies: Sequence[TestBody] = BODIES,
-    dtype: torch.dtype = torch.float32,
-) -> Iterator[tuple[int, TestBody, SomaLayer, PoseInversion]]:
-    """Number, body, layer and fit of each body; one layer for each backend."""
-    made: dict[str, tuple[SomaLayer, PoseInversion]] = {}
-    for index, body in enumerate(bodies):
-        if body.backend not in made:
-            layer = make(body.backend, lod=lod, device=device, dtype=dtype)
-            made[body.backend] = layer, invert(layer)
-        yield index, body, *made[body.backend]
+@dataclass(frozen=True, kw_only=True)
+class Trial:
+    """What a piece is measured on.
+
+    Attributes:
+        make: the layer under test.
+        count, seed: frames of each motion, and which.
+        lod: of the layer.
+        invert: the fit.
+        device: of both.
+        against: layer whose mean error is taken from that of the layer under test.
+    """
+
+    make: LayerMaker
+    count: int
+    seed: int
+    lod: Lod
+    invert: InversionMaker
+    device: str
+    against: LayerMaker
+
+    def bodies(
+        self, some: Sequence[TestBody] | None = None, dtype: torch.dtype = torch.float32
+    ) -> Iterator[tuple[int, TestBody, SomaLayer, PoseInversion]]:
+        """Number, body, layer and fit of each body; one layer for each backend."""
+        made: dict[str, tuple[SomaLayer, PoseInversion]] = {}
+        for index, body in enumerate(BODIES if some is None else some):
+            if body.backend not in made:
+                layer = self.make(body.backend, lod=self.lod, device=self.device, dtype=dtype)
+                made[body.backend] = layer, self.invert(layer)
+            yield index, body, *made[body.backend]
+
+    def random(self, *place: int) -> np.random.Generator:
+        """Random numbers of one motion."""
+        return np.random.default_rng([self.seed, *place])
+
+
+def piece(measure: Callable[[Trial], Piece]) -> Callable[..., Piece]:
+    """The piece as a function ``(make, count, seed, lod="mid", *, invert, device, against)``."""
+
+    def run(
+        make: LayerMaker,
+        count: int,
+        seed: int,
+        lod: Lod = "mid",
+        *,
+        invert: InversionMaker = PoseInversion,
+        device: str = "cpu",
+        against: LayerMaker = plain_layer,
+    ) -> Piece:
+        return measure(
+            Trial(make=make, count=count, seed=seed, lod=lod, invert=invert, device=device, against=against)
+        )
+
+    run.__name__, run.__doc__ = measure.__name__, measure.__doc__
+    return run
 
 
 def own_fit(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 import torch
@@ -10,15 +11,14 @@ from torch import Tensor
 
 from soma_core.evaluation.anny_rig import HINGE_BONES, AnnyClip, hinge_clip, smooth_clip
 from soma_core.evaluation.joint_turns import TurnExcess, angles_between, bone_turns, turn_excess
-from soma_core.evaluation.pose_angle_fits import Fit, InversionMaker, Piece, fit_frames
+from soma_core.evaluation.pose_angle_fits import Fit, Piece, Trial, fit_frames, piece
 from soma_core.evaluation.pose_angle_meshes import ANNY_BODIES
 from soma_core.evaluation.report import Figure, Table
-from soma_core.evaluation.shipped_layers import LayerMaker, layer_label, plain_layer
+from soma_core.evaluation.shipped_layers import layer_label
 from soma_core.geometry.rotations import matrix_to_axis_angle
 from soma_core.inversion import InversionResult, PoseInversion
 from soma_core.inversion.priors import HINGES, hinge_rotation
 from soma_core.layer import SomaLayer
-from soma_core.rig.mesh import Lod
 from soma_core.skeleton.identity import Identity
 
 __all__ = ["anny_rig_hinges", "anny_rig_motions"]
@@ -32,31 +32,20 @@ _CLIP = 100
 """Frames of a whole motion; of a shorter one the first are taken, so that frames stay as near in time."""
 
 
-def anny_rig_motions(
-    make: LayerMaker,
-    count: int,
-    seed: int,
-    lod: Lod = "mid",
-    *,
-    invert: InversionMaker = PoseInversion,
-    device: str = "cpu",
-    against: LayerMaker = plain_layer,
-) -> Piece:
+@piece
+def anny_rig_motions(trial: Trial) -> Piece:
     """Fit smooth motions of Anny's own rig: five bodies, `count` frames each.
 
     The greatest turn of a body joint between two frames, in the world, less that of the bone of Anny that
     carries the same skin (`BONES_OF`; the bone that turned most, where there are several).
-
-    Args:
-        make, count, seed, lod, invert, device: as of every piece.
-        against: layer whose mean error is taken from that of the layer under test.
     """
-    layer, other = make("anny", lod=lod, device=device), against("anny", lod=lod, device=device)
-    inversion, reference = invert(layer), PoseInversion(other)
+    which: Any = {"lod": trial.lod, "device": trial.device}
+    layer, other = trial.make("anny", **which), trial.against("anny", **which)
+    inversion, reference = trial.invert(layer), PoseInversion(other)
     label, rows, fits, over, excesses = layer_label(layer), [], [], [], []
     for index, (who, params) in enumerate(ANNY_BODIES.items()):
-        clip = smooth_clip(params, max(count, _CLIP), np.random.default_rng([seed, 13, index]))
-        clip = _first(clip, count)
+        clip = smooth_clip(params, max(trial.count, _CLIP), trial.random(13, index))
+        clip = _first(clip, trial.count)
         fit = fit_frames(inversion, clip.vertices, layer.identity(params), topology="native")
         known = fit_frames(reference, clip.vertices, other.identity(params), topology="native")
         excess = turn_excess(layer, _result(fit).rotations, bone_turns(clip))
@@ -110,30 +99,23 @@ def _first(clip: AnnyClip, count: int) -> AnnyClip:
     )
 
 
-def anny_rig_hinges(
-    make: LayerMaker,
-    count: int,
-    seed: int,
-    lod: Lod = "mid",
-    *,
-    invert: InversionMaker = PoseInversion,
-    device: str = "cpu",
-) -> Piece:
+@piece
+def anny_rig_hinges(trial: Trial) -> Piece:
     """Fit motions of Anny's own rig whose elbows and knees turn as hinges, about the axes of `HINGES`.
 
     The axes of our T-pose are carried to Anny's rest pose by the skeleton that was fitted to it. What a fit's
     elbow turned from there has an axis: the angle between both, over frames bent by 30 degrees or more; and
     how far it turned otherwise than about the hinge, over all frames.
     """
-    layer = make("anny", lod=lod, device=device)
-    inversion, label = invert(layer), layer_label(layer)
+    layer = trial.make("anny", lod=trial.lod, device=trial.device)
+    inversion, label = trial.invert(layer), layer_label(layer)
     rows: list[tuple[str | float, ...]] = []
     off_axis: list[np.ndarray] = []
     beside: list[np.ndarray] = []
     for index, (who, params) in enumerate(ANNY_BODIES.items()):
         identity = layer.identity(params)
         rest = _rest_turns(layer, identity)
-        clip = hinge_clip(params, _anny_axes(layer, rest), count, np.random.default_rng([seed, 14, index]))
+        clip = hinge_clip(params, _anny_axes(layer, rest), trial.count, trial.random(14, index))
         fit = fit_frames(inversion, clip.vertices, identity, topology="native")
         axis, other = _off_hinge(layer, fit, clip, rest)
         for joint in HINGE_BONES:

@@ -12,11 +12,11 @@ from soma_core.evaluation.ground_contact import motion_files
 from soma_core.evaluation.joint_turns import angles_between
 from soma_core.evaluation.pose_angle_fits import (
     Fit,
-    InversionMaker,
     Piece,
-    each_body,
+    Trial,
     finger_joints,
     fit_frames,
+    piece,
     posed_vertices,
     visible_joints,
 )
@@ -28,11 +28,10 @@ from soma_core.evaluation.pose_angle_meshes import (
     smooth_poses,
 )
 from soma_core.evaluation.report import Figure, Table
-from soma_core.evaluation.shipped_layers import LayerMaker, layer_label
+from soma_core.evaluation.shipped_layers import layer_label
 from soma_core.geometry.rotations import axis_angle_to_matrix
 from soma_core.inversion import PoseInversion
 from soma_core.io.motion_files import read_motion
-from soma_core.rig.mesh import Lod
 from soma_core.skeleton.identity import Identity
 
 __all__ = ["claimed_spread", "gradients", "noisy_targets"]
@@ -102,15 +101,8 @@ class _Motion:
         return torch.as_tensor(drawn).to(self.vertices)
 
 
-def noisy_targets(
-    make: LayerMaker,
-    count: int,
-    seed: int,
-    lod: Lod = "mid",
-    *,
-    invert: InversionMaker = PoseInversion,
-    device: str = "cpu",
-) -> Piece:
+@piece
+def noisy_targets(trial: Trial) -> Piece:
     """Fit smooth motions of two bodies with noise, with outliers, and with vertices that are missing.
 
     Noise is normal in every coordinate. Motions in the folder ``motions`` of SOMA_TEST_DATA get it too: the
@@ -120,19 +112,19 @@ def noisy_targets(
     """
     fits: dict[str, list[Fit]] = {}
     label = ""
-    for index, body, layer, inversion in each_body(make, lod, invert, device, _FEW):
+    for index, body, layer, inversion in trial.bodies(_FEW):
         label = layer_label(layer)
-        random = np.random.default_rng([seed, 15, index])
-        motion = _Motion.of(body, inversion, count, random)
+        random = trial.random(15, index)
+        motion = _Motion.of(body, inversion, trial.count, random)
         moved = {"": motion}
-        if recorded := _Motion.recorded(body, inversion, count):
+        if recorded := _Motion.recorded(body, inversion, trial.count):
             moved["recorded motions, "] = recorded
         for of, one in moved.items():
             for mm in _NOISE_DEGREES:
                 noisy = one.vertices + 1e-3 * mm * one.normal(random)
                 fits.setdefault(f"{of}noise of {mm} mm", []).append(one.fit(noisy))
         outliers = _with_outliers(motion, random)
-        robust = invert(layer, robust=_ROBUST)
+        robust = trial.invert(layer, robust=_ROBUST)
         fits.setdefault("outliers, robust", []).append(motion.fit(outliers, robust))
         missing = torch.as_tensor(random.uniform(size=motion.vertices.shape[1]) < _MISSING).to(layer.device)
         weights = torch.where(missing, 0.0, torch.as_tensor(inversion.default_weights))
@@ -197,15 +189,8 @@ def _noise_figures(label: str, found: dict[str, Fit]) -> list[Figure]:
     ]  # fmt: skip
 
 
-def claimed_spread(
-    make: LayerMaker,
-    count: int,
-    seed: int,
-    lod: Lod = "mid",
-    *,
-    invert: InversionMaker = PoseInversion,
-    device: str = "cpu",
-) -> Piece:
+@piece
+def claimed_spread(trial: Trial) -> Piece:
     """Compare ``result.angle_std`` (F, J - 1) [degrees] with what `count` draws of 5 mm noise do.
 
     By joint, over four frames of each of two bodies: the root mean square angle between fitted and true
@@ -214,12 +199,12 @@ def claimed_spread(
     rows: list[tuple[str | float, ...]] = []
     ratios: list[np.ndarray] = []
     label = ""
-    for index, body, layer, inversion in each_body(make, lod, invert, device, _FEW):
+    for index, body, layer, inversion in trial.bodies(_FEW):
         label = layer_label(layer)
-        random = np.random.default_rng([seed, 16, index])
+        random = trial.random(16, index)
         motion = _Motion.of(body, inversion, _SPREAD_FRAMES, random)
         angles, claims = [], []
-        for _ in range(count):
+        for _ in range(trial.count):
             fit = motion.fit(motion.vertices + _SPREAD_NOISE * motion.normal(random))
             claimed = getattr(fit.result, "angle_std", None)
             if claimed is None:
@@ -248,15 +233,8 @@ def claimed_spread(
     return Piece(layer=label, table=table, figures=figures)
 
 
-def gradients(
-    make: LayerMaker,
-    count: int,
-    seed: int,
-    lod: Lod = "mid",
-    *,
-    invert: InversionMaker = PoseInversion,
-    device: str = "cpu",
-) -> Piece:
+@piece
+def gradients(trial: Trial) -> Piece:
     """Compare gradients through a fit, in float64, with those of its known inverse.
 
     Where the layer posed the target, posing and fitting is the identity, so that a gradient that goes back
@@ -265,10 +243,10 @@ def gradients(
     """
     rows = []
     label, worst = "", 0.0
-    for index, body, layer, inversion in each_body(make, lod, invert, device, _FEW, torch.float64):
+    for index, body, layer, inversion in trial.bodies(_FEW, torch.float64):
         label = layer_label(layer)
-        random = np.random.default_rng([seed, 17, index])
-        motion = _Motion.of(body, inversion, min(count, _GRADIENT_FRAMES), random)
+        random = trial.random(17, index)
+        motion = _Motion.of(body, inversion, min(trial.count, _GRADIENT_FRAMES), random)
         relative, angle = _gradient_errors(motion, random)
         worst = max(worst, float(relative.max()))
         rows.append(

@@ -23,15 +23,13 @@ from dataclasses import replace
 import numpy as np
 from omegaconf import DictConfig
 
-from soma_core.evaluation.pose_angle_fits import COLUMNS, Fit, InversionMaker, Piece, each_body, own_fit
+from soma_core.evaluation.pose_angle_fits import COLUMNS, Fit, Piece, Trial, own_fit, piece
 from soma_core.evaluation.pose_angle_foreign import anny_rig_hinges, anny_rig_motions
 from soma_core.evaluation.pose_angle_meshes import LIMITS, named_poses, strong_poses
 from soma_core.evaluation.pose_angle_noise import claimed_spread, gradients, noisy_targets
 from soma_core.evaluation.report import Figure, Report, Table
-from soma_core.evaluation.shipped_layers import LAYERS, LayerMaker, layer_label
-from soma_core.inversion import PoseInversion
+from soma_core.evaluation.shipped_layers import LAYERS, layer_label
 from soma_core.progress import progress
-from soma_core.rig.mesh import Lod
 
 __all__ = ["PIECES", "exact_poses", "run", "show", "strong_random_poses"]
 
@@ -42,9 +40,9 @@ _NEAR_DEGREES, _MISSED_PERCENT = 1.0, 1.0
 def run(config: DictConfig) -> Report:
     """Run every piece on both layers, `config.experiment.count` frames each, at the mid level of detail."""
     tables, figures = [], []
-    for piece in progress(PIECES.values(), label="piece", total=len(PIECES)):
+    for measured in progress(PIECES.values(), label="piece", total=len(PIECES)):
         found = [
-            piece(make, config.experiment.count, config.seed, "mid", device=config.device)
+            measured(make, config.experiment.count, config.seed, "mid", device=config.device)
             for make in LAYERS.values()
         ]
         rows = [row for one in found for row in one.table.rows]
@@ -63,28 +61,21 @@ def run(config: DictConfig) -> Report:
     )
 
 
-def show(piece: Piece) -> str:
+def show(found: Piece) -> str:
     """A piece as text: its table, then its figures."""
-    return Report(title=piece.layer, tables=[piece.table], figures=piece.figures).as_markdown()
+    return Report(title=found.layer, tables=[found.table], figures=found.figures).as_markdown()
 
 
-def exact_poses(
-    make: LayerMaker,
-    count: int,
-    seed: int,
-    lod: Lod = "mid",
-    *,
-    invert: InversionMaker = PoseInversion,
-    device: str = "cpu",
-) -> Piece:
+@piece
+def exact_poses(trial: Trial) -> Piece:
     """Fit named poses, hinges and smooth motions that the layer itself posed, on several bodies."""
     by_pose: dict[str, list[Fit]] = {}
     by_body: dict[str, Fit] = {}
     label = ""
-    for index, body, layer, inversion in each_body(make, lod, invert, device):
+    for index, body, layer, inversion in trial.bodies():
         label = layer_label(layer)
-        random = np.random.default_rng([seed, 11, index])
-        poses = named_poses(layer, count, random)
+        random = trial.random(11, index)
+        poses = named_poses(layer, trial.count, random)
         fit = own_fit(inversion, body, np.concatenate(list(poses.values())), random)
         by_body[body.name], begin = fit, 0
         for name, vectors in poses.items():
@@ -106,23 +97,16 @@ def exact_poses(
     return Piece(layer=label, table=table, figures=figures)
 
 
-def strong_random_poses(
-    make: LayerMaker,
-    count: int,
-    seed: int,
-    lod: Lod = "mid",
-    *,
-    invert: InversionMaker = PoseInversion,
-    device: str = "cpu",
-) -> Piece:
+@piece
+def strong_random_poses(trial: Trial) -> Piece:
     """Fit strong random poses that the layer itself posed: `count` of each body and limit."""
     fits: dict[float, list[Fit]] = {limit: [] for limit in LIMITS}
     label = ""
-    for index, body, layer, inversion in each_body(make, lod, invert, device):
+    for index, body, layer, inversion in trial.bodies():
         label = layer_label(layer)
         for number, limit in enumerate(LIMITS):
-            random = np.random.default_rng([seed, 12, index, number])
-            vectors = strong_poses(layer, count, limit, random)
+            random = trial.random(12, index, number)
+            vectors = strong_poses(layer, trial.count, limit, random)
             fits[limit].append(own_fit(inversion, body, vectors, random))
     joined = {f"cut at {limit} rad": Fit.joined(found) for limit, found in fits.items()}
     everything = Fit.joined(list(joined.values()))

@@ -17,7 +17,7 @@ from soma_core.evaluation import (
     pose_angles,
 )
 from soma_core.evaluation.joint_turns import angles_between
-from soma_core.evaluation.pose_angle_fits import Fit, each_body, finger_joints, own_fit
+from soma_core.evaluation.pose_angle_fits import Fit, finger_joints, own_fit
 from soma_core.evaluation.pose_angle_meshes import (
     BODIES,
     LIMITS,
@@ -47,7 +47,7 @@ def layer():
 def native_only(monkeypatch):
     """One native body in place of four, so that a piece takes seconds and needs no plugin."""
     monkeypatch.setattr(pose_angle_noise, "_FEW", BODIES[:1])
-    monkeypatch.setattr(each_body, "__defaults__", (BODIES[:1], torch.float32))
+    monkeypatch.setattr(pose_angle_fits, "BODIES", BODIES[:1])
 
 
 def values(piece):
