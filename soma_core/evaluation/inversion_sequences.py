@@ -22,7 +22,7 @@ from soma_core.io import read_motion
 from soma_core.layer import SomaLayer
 from soma_core.paths import assets_dir
 
-__all__ = ["ANNY_IDENTITIES", "MovingMesh", "anny_meshes", "anny_native_vertices", "own_meshes"]
+__all__ = ["ANNY_IDENTITIES", "MovingMesh", "anny_meshes", "own_meshes"]
 
 ANNY_IDENTITIES: dict[str, dict[str, float]] = {
     "man": {"gender": 0.8, "age": 0.65, "muscle": 0.6, "weight": 0.45, "height": 0.6, "proportions": 0.6},
@@ -114,12 +114,3 @@ def anny_meshes(count: int, seed: int) -> Iterator[MovingMesh]:
             topology="native",
             turns=bone_turns(clip),
         )
-
-
-def anny_native_vertices(params: Mapping[str, float], count: int, random: np.random.Generator) -> Tensor:
-    """Posed vertices (count, n, 3) [m], +Z up, of a smooth motion of Anny's own rig.
-
-    Raises:
-        InputError: the anny package is not installed.
-    """
-    return smooth_clip(params, count, random).vertices

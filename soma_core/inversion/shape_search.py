@@ -11,8 +11,7 @@ import torch
 from torch import Tensor
 
 from soma_core.inversion.fit import PoseInversion
-from soma_core.inversion.free_joints import WithJoints
-from soma_core.inversion.free_parameters import FreeParameters
+from soma_core.inversion.free_parameters import FreeParameters, WithJoints
 from soma_core.inversion.levenberg import Bounded, Damping, bounded_step, descend, promising
 from soma_core.inversion.result import InversionResult
 from soma_core.inversion.shape_response import shape_normal_equations

@@ -24,11 +24,11 @@ from soma_core.files import refuse_unreadable
 from soma_core.io.json_frames import holds_pose_frames, read_pose_frames
 from soma_core.io.motion_pickle import array_text, is_tensor, run_motion_pickle, tensor_array
 from soma_core.io.pickled_arrays import RecordArrays
-from soma_core.io.torch_file import read_torch_arrays
 from soma_core.npz import ArrayHeader, NpzFile, open_npz_file, read_array_header
 from soma_core.pickle_machine import Record, RefusedPickleError
+from soma_core.tensor_archive import read_tensor_archive
 
-__all__ = ["DATA_SUFFIXES", "DataFile", "open_data"]
+__all__ = ["DATA_SUFFIXES", "DataFile", "open_data", "read_torch_arrays"]
 
 DATA_SUFFIXES = (".npz", ".npy", ".pkl", ".pickle", ".pt", ".pth")
 """Files that are read."""
@@ -210,6 +210,27 @@ def _npy_value(path: Path) -> Any:
         return flat.reshape(header.shape, order="F" if header.fortran else "C")
 
     return _Member(read, header)
+
+
+def read_torch_arrays(path: Path | str) -> Any:
+    """Contents of a ``.pt`` or ``.pth`` file: nested dictionaries, lists, tuples, arrays and plain values.
+
+    Tensors come as arrays in native byte order (bfloat16 as float32, sparse ones dense), which may be
+    read-only views of each other; numpy's arrays as they are; keys are text or integers. Nothing is run,
+    and nothing is built that the metadata of the file do not bear out.
+
+    Raises:
+        AssetError: as :func:`~soma_core.tensor_archive.read_tensor_archive`; the cause names the keys that
+            lead to what cannot be read.
+    """
+    refuse_unreadable(path)
+    arrays = RecordArrays(Path(path).stat().st_size)
+    return read_tensor_archive(
+        path,
+        fix="Save plain tensors: torch.save({'name': tensor.cpu()}, FILE).",
+        sparse=arrays.dense,
+        other=arrays.array,
+    )
 
 
 def _pickled(path: Path) -> Any:

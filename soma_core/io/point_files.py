@@ -12,14 +12,11 @@ from typing import Any
 import numpy as np
 
 from soma_core.errors import InputError
-from soma_core.io.data_files import DATA_SUFFIXES, open_data
+from soma_core.io.data_files import open_data
 from soma_core.io.json_frames import frame_files
 from soma_core.json_file import read_json
 
-__all__ = ["POINT_SUFFIXES", "PointFrames", "is_one", "read_points"]
-
-POINT_SUFFIXES = (*DATA_SUFFIXES, ".csv", ".json")
-"""Files that may hold points; a folder of ``.json`` has a file a frame."""
+__all__ = ["PointFrames", "is_one", "read_points"]
 
 _KEYS = (
     "points", "joints", "joints3d", "joints_3d", "keypoints", "keypoints3d", "keypoints_3d", "kpts3d",

@@ -10,6 +10,7 @@ from omegaconf import OmegaConf
 
 from soma_core.errors import InputError, SomaError
 from soma_core.evaluation import (
+    anny_rig,
     conversion_matrix,
     inversion_sequences,
     table2_inversion,
@@ -183,7 +184,7 @@ def test_annys_own_rig_gives_bodies_that_the_fit_explains():
 def test_a_missing_anny_package_is_named(monkeypatch):
     monkeypatch.setitem(__import__("sys").modules, "anny", None)
     with pytest.raises(InputError, match=r"got no anny, expected anny installed\. Run: pip install anny"):
-        inversion_sequences.anny_native_vertices({}, 2, np.random.default_rng(0))
+        anny_rig.smooth_clip({}, 2, np.random.default_rng(0))
 
 
 @pytest.fixture

@@ -20,13 +20,13 @@ from soma_core.backends.native import component_count
 from soma_core.correctives.weights import read_weights
 from soma_core.errors import InputError
 from soma_core.io import open_vertex_sequence, read_amass, read_motion, read_smpl
+from soma_core.io.data_files import read_torch_arrays
 from soma_core.io.json_frames import read_pose_frames
 from soma_core.io.mesh_vertices import read_mesh_vertices, read_ply_triangles
 from soma_core.io.pickled_arrays import read_pickled_arrays
 from soma_core.io.sam3d import read_sam3d
 from soma_core.io.skeleton_files import read_skeleton
 from soma_core.io.smpl_camera import in_world
-from soma_core.io.torch_file import read_torch_arrays
 from soma_core.obj import read_obj
 from soma_core.rig.manifest import MANIFEST_NAME, read_manifest
 from soma_core.rig.neutral import load_shape_space, read_topology

@@ -256,10 +256,10 @@ def test_errors_of_each_vertex_serve_as_well(layers):
 
 def test_native_vertices_are_told_by_what_they_become(layers):
     pytest.importorskip("anny")
-    from soma_core.evaluation.inversion_sequences import anny_native_vertices
+    from soma_core.evaluation.anny_rig import smooth_clip
 
     layer, params = layers["anny"], {"age": 0.67}
-    native = anny_native_vertices(params, 6, np.random.default_rng(0))
+    native = smooth_clip(params, 6, np.random.default_rng(0)).vertices
     inversion, identity = PoseInversion(layer), layer.identity(params)
 
     def found(vertices, error=0.005):

@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from soma_core.inversion.free_joints import WithJoints, body_joints
-from soma_core.inversion.free_parameters import FreeParameters
+from soma_core.inversion.free_parameters import FreeParameters, WithJoints, body_joints
 from soma_core.layer import SomaLayer
 
 UNIT_M = 0.01

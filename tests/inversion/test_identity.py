@@ -9,8 +9,7 @@ import torch
 from soma_core.errors import InputError
 from soma_core.geometry.rotations import axis_angle_to_matrix
 from soma_core.inversion import PoseInversion, fit_identity
-from soma_core.inversion.free_joints import WithJoints
-from soma_core.inversion.free_parameters import FreeParameters
+from soma_core.inversion.free_parameters import FreeParameters, WithJoints
 from soma_core.layer import SomaLayer
 from soma_core.plugin.registry import Registry
 from soma_core.plugin.spec import Parameter

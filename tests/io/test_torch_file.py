@@ -12,7 +12,7 @@ import pytest
 import torch
 
 from soma_core.errors import AssetError
-from soma_core.io.torch_file import read_torch_arrays
+from soma_core.io.data_files import read_torch_arrays
 
 NUMBERS = torch.arange(24.0).reshape(2, 3, 4)
 
