@@ -38,6 +38,12 @@ __all__ = [
 ]
 
 _NAME = re.compile(r"[A-Za-z_][A-Za-z0-9_-]*")
+_LAYOUTS = {"soma", "kimodo", "amass", "smpl", "sam3d", "skeleton", "vertices"}
+"""Layouts of motions that the core knows by name."""
+
+_SHARED_SUFFIXES = {".npz", ".npy", ".pkl", ".pickle", ".pt", ".pth"}
+"""Of files in which anybody keeps anything; names in them tell what they are."""
+
 _SUFFIX = re.compile(r"\.[a-z0-9]+")
 
 
@@ -173,8 +179,15 @@ def formats_problem(formats: Iterable[object]) -> str | None:
             texts = getattr(each, key)
             if not (isinstance(texts, tuple) and all(isinstance(text, str) for text in texts)):
                 return f"{key} of the motion format {each.name} is {texts!r}, expected a tuple of texts"
+        if each.name in _LAYOUTS:
+            return f"the motion format {each.name!r} is one of the core's own; choose another name"
         if not each.suffixes or not all(_SUFFIX.fullmatch(suffix) for suffix in each.suffixes):
             return f"suffixes of the motion format {each.name} are {each.suffixes!r}, expected like ('.npz',)"
+        shared = sorted({*each.suffixes} & _SHARED_SUFFIXES)
+        if shared and not each.keys:
+            return (
+                f"the motion format {each.name} claims every {shared[0]} file; name keys that its files hold"
+            )
         calls = [call for call in (each.read, each.write) if call is not None]
         if not calls or not all(map(callable, calls)):
             return f"the motion format {each.name} has neither read nor write that can be called"

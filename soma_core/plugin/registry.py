@@ -190,6 +190,11 @@ class Registry:
             generator = record.manager.hook.soma_generator(
                 spec=spec, device=device, dtype=dtype, options=given
             )
+            if isinstance(generator, type):
+                raise PluginError(
+                    f"soma_generator returned the class {generator.__name__}, expected an instance",
+                    fix=f"Call it: return {generator.__name__}(...)",
+                )
             if not callable(getattr(generator, "rest", None)):
                 raise PluginError(f"soma_generator returned {type(generator).__name__} without a rest method")
         record.state, record.error = "built", None

@@ -313,7 +313,7 @@ class MotionFormat:
     Attributes:
         name: how reports call it.
         suffixes: of its files, such as ``(".npz",)``.
-        keys: names that an NPZ, a pickle or a file of tensors holds; empty where the suffix says enough.
+        keys: names that an NPZ, a pickle or a file of tensors holds; empty for other suffixes.
         read: makes a motion of a file; needs ``posed()``. None where files are only written.
         write: writes a motion to a path; needs ``skinning()`` or a pose vector. None: files are only read.
     """

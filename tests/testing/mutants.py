@@ -277,6 +277,11 @@ MUTANTS = (
     Mutant(
         "generator-builds", "got build: ImportError: no model", _before_build("raise ImportError('no model')")
     ),
+    Mutant(
+        "generator-builds",
+        "returned the class Specimen, expected an instance",
+        _before_build("return Specimen"),
+    ),
     Mutant("generator-shape", r"batch of 1: got \(\d+, 3\), expected a tensor", _rest("v.squeeze(0)")),
     Mutant(
         "generator-shape", r"batch of 1: got \(1, \d+, 3\), expected .* of the native OBJ", _rest("v[:, 1:]")
@@ -323,6 +328,11 @@ MUTANTS = (
         "deterministic",
         r"rest\(\) of a new generator, native vertex",
         _rest("vars(self).setdefault(len(v), v)"),
+    ),
+    Mutant(
+        "deterministic",
+        r"the result of rest\(\), once rest\(\) was called again, native vertex",
+        _rest("v if torch.is_grad_enabled() else vars(self).setdefault((v.shape, v.device), 1 * v).copy_(v)"),
     ),
     Mutant("batch-invariant", "random body 0 in a batch of 4", _rest("v + 1e-4 * (v - v.mean(0))")),
     Mutant(
@@ -426,6 +436,8 @@ MUTANTS = (
     ),
     Mutant("motion-formats", "got dict from read", _in(_MOTION, "return ModelMotion(", "return dict(")),
     Mutant("own-checks", "soma_motions gave 'x'", _in(_INIT, "return [FORMAT]", 'return ["x"]')),
+    Mutant("own-checks", "claims every .npz", _in(_MOTION, 'keys=("specimen_turns", "shift")', "keys=()")),
+    Mutant("own-checks", "'amass' is one of the core's", _in(_MOTION, 'name="specimen"', 'name="amass"')),
     Mutant("own-checks", "suffixes of the motion format", _in(_MOTION, '(".npz",)', '("npz",)')),
     Mutant(
         "parameters",
@@ -460,6 +472,15 @@ MUTANTS = (
         "linear-basis",
         r"linear_basis\(\), native vertex \d+ of random body \d: got",
         _in(_GENERATOR, "basis=self.fields", "basis=1.01 * self.fields"),
+    ),
+    Mutant(
+        "linear-basis",
+        r"derivative of linear_basis\(\) by shape: got 0, expected .*, that of rest",
+        _in(
+            _GENERATOR,
+            "coefficients=self.coefficients",
+            "coefficients=lambda params: self.coefficients(params).detach()",
+        ),
     ),
     Mutant(
         "upright",

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from soma_core.plugin.checks import CheckFailedError, check
 from soma_core.plugin.spec import HasLinearBasis, LinearBasis
@@ -15,6 +17,9 @@ __all__ = ["CHECKS"]
 
 _OBJ_M = 1e-4
 """Metres. Files with four decimals of a metre, or two of a centimetre, keep a tenth of a millimetre."""
+
+_SLOPE = 1e-6
+"""Relative difference of derivatives; float64 sums over some hundred directions."""
 
 _LINEAR_M = 1e-6
 """Metres. float64 sums over some hundred directions; far below what a file or float32 keeps."""
@@ -62,7 +67,7 @@ def _not_linear(context: Context) -> str:
     unless=_not_linear,
 )
 def linear_basis(context: Context) -> None:
-    """The linear basis gives the same bodies as the generator."""
+    """The linear basis gives the same bodies as the generator, and the same derivatives."""
     params = context.random_params() or context.default_params()
     assert isinstance(context.generator, HasLinearBasis)
     with torch.no_grad():
@@ -82,6 +87,37 @@ def linear_basis(context: Context) -> None:
             expected=f"at most {1000 * _LINEAR_M:.3f} mm",
             fix="Return template, basis and coefficients with template + coefficients @ basis = rest().",
         )
+    _compare_slopes(context, linear, params)
+
+
+def _compare_slopes(context: Context, linear: LinearBasis, params: Mapping[str, Tensor]) -> None:
+    """Refuse coefficients that lose the derivative that rest() has: layers are composed of them."""
+    random = torch.Generator(device="cpu").manual_seed(0)
+    cotangent = torch.randn(linear.template.shape, generator=random, dtype=torch.float64, device="cpu")
+
+    def slopes(body: Callable[[dict[str, Tensor]], Tensor]) -> dict[str, Tensor]:
+        leaves = {name: value.clone().requires_grad_() for name, value in params.items()}
+        with torch.enable_grad():
+            total = (body({name: leaf * 1 for name, leaf in leaves.items()}) * cotangent).sum()
+            if total.requires_grad:
+                total.backward()
+        return {
+            name: torch.zeros_like(leaf) if leaf.grad is None else leaf.grad for name, leaf in leaves.items()
+        }
+
+    wanted = slopes(context.generator.rest)
+    found = slopes(
+        lambda given: linear.template + torch.einsum("bk,knc->bnc", linear.coefficients(given), linear.basis)
+    )
+    for name, slope in wanted.items():
+        if not torch.allclose(found[name], slope, rtol=0, atol=_SLOPE * float(slope.abs().max())):
+            worst = int((found[name] - slope).abs().argmax())
+            raise CheckFailedError(
+                f"derivative of linear_basis() by {name}",
+                got=f"{float(found[name].flatten()[worst]):.6g}",
+                expected=f"{float(slope.flatten()[worst]):.6g}, that of rest()",
+                fix="Compute coefficients in torch, without detach, .data, NumPy or no_grad.",
+            )
 
 
 CHECKS = (neutral_equals_obj, linear_basis)

@@ -56,6 +56,13 @@ def deterministic(context: Context) -> None:
     second = _rest(generator, other)
     _compare(context, _rest(generator, first), body, "rest() called again after other parameters", fix)
     _compare(context, _rest(context.new_generator(), other), second, "rest() of a new generator", fix)
+    with torch.no_grad():
+        kept = generator.rest({name: value.clone() for name, value in first.items()})
+    _rest(generator, other)
+    again = "the result of rest(), once rest() was called again"
+    _compare(
+        context, kept, body, again, "Return new memory from each call, not a buffer that the next one fills."
+    )
 
 
 @check(
