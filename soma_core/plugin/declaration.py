@@ -26,6 +26,7 @@ from soma_core.plugin.spec import (
 )
 
 __all__ = [
+    "CORE_LAYOUTS",
     "checks_problem",
     "did_you_mean",
     "expressions_problem",
@@ -38,7 +39,7 @@ __all__ = [
 ]
 
 _NAME = re.compile(r"[A-Za-z_][A-Za-z0-9_-]*")
-_LAYOUTS = {"soma", "kimodo", "amass", "smpl", "sam3d", "skeleton", "vertices"}
+CORE_LAYOUTS = {"soma", "kimodo", "amass", "smpl", "sam3d", "skeleton", "vertices"}
 """Layouts of motions that the core knows by name."""
 
 _SHARED_SUFFIXES = {".npz", ".npy", ".pkl", ".pickle", ".pt", ".pth"}
@@ -179,7 +180,7 @@ def formats_problem(formats: Iterable[object]) -> str | None:
             texts = getattr(each, key)
             if not (isinstance(texts, tuple) and all(isinstance(text, str) for text in texts)):
                 return f"{key} of the motion format {each.name} is {texts!r}, expected a tuple of texts"
-        if each.name in _LAYOUTS:
+        if each.name in CORE_LAYOUTS:
             return f"the motion format {each.name!r} is one of the core's own; choose another name"
         if not each.suffixes or not all(_SUFFIX.fullmatch(suffix) for suffix in each.suffixes):
             return f"suffixes of the motion format {each.name} are {each.suffixes!r}, expected like ('.npz',)"

@@ -192,8 +192,7 @@ class Registry:
             )
             if isinstance(generator, type):
                 raise PluginError(
-                    f"soma_generator returned the class {generator.__name__}, expected an instance",
-                    fix=f"Call it: return {generator.__name__}(...)",
+                    f"soma_generator returned the class {generator.__name__}, expected an instance"
                 )
             if not callable(getattr(generator, "rest", None)):
                 raise PluginError(f"soma_generator returned {type(generator).__name__} without a rest method")

@@ -33,6 +33,10 @@ _MITTEN = 2
 _OUTER = 0.3
 """Share of a digit's length from its base that may lie on its neighbour: where fingers begin is not sharp."""
 
+_FUSED = 0.6
+"""Share of a digit's length up to which it may lie where the skin has no digits: those of a scan, or of a hand
+whose fingers touch, are one as far as that."""
+
 _SEGMENTS = (
     ("head", "Head|Neck|Jaw|Eye"),
     (r"\1\2", "(Left|Right)Hand(Thumb|Index|Middle|Ring|Pinky).*"),
@@ -145,8 +149,9 @@ def matches(wrap: np.ndarray, surface: Surface, digits: Digits, guide: DigitGuid
         on = _most(native[:, surface.triangles[there.faces]], there.shares)
         by = _most(own[:, triangles[here.faces]], here.shares)
         for digit in range(len(own)):
+            right = (on == digit) | ((on == len(own)) & (own[digit] < _FUSED))
             found[_digit_name(limb, digit)] = Share(
-                wrap=_mean(on[own[digit] > _OUTER] == digit),
+                wrap=_mean(right[own[digit] > _OUTER]),
                 native=_mean(by[native[digit] > _OUTER] == digit),
             )
     return found

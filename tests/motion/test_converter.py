@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import logging
+from typing import get_args
 
 import numpy as np
 import pytest
@@ -15,6 +16,9 @@ from soma_core.errors import InputError
 from soma_core.io import USER_JOINTS, Motion, read_motion, write_motion
 from soma_core.io.skeleton_motion import soma_skeleton
 from soma_core.motion import ConvertOptions, convert_file, converter, fit_job, layout_of
+from soma_core.motion.bodies import FITTED
+from soma_core.motion.files import Layout
+from soma_core.plugin.declaration import CORE_LAYOUTS
 from soma_core.plugin.errors import BackendError
 from soma_core.plugin.registry import default_registry
 from tests.motion.conftest import AMASS_FRAMES
@@ -37,6 +41,10 @@ def motion(frames=3, **changes):
     turns = Rotation.random(77 * frames, random_state=0).as_matrix().reshape(frames, 77, 3, 3)
     values = {"rotations": turns, "translation": np.ones((frames, 3)), "fps": 24, "joint_names": USER_JOINTS}
     return Motion(**values | changes)
+
+
+def test_no_plugin_takes_the_name_of_a_layout():
+    assert {*get_args(Layout), *FITTED} == CORE_LAYOUTS
 
 
 def test_our_own_file_is_carried_over_exactly(tmp_path):

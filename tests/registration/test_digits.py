@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import trimesh
@@ -87,6 +89,17 @@ def test_a_finger_on_its_neighbour_is_found_out(guide, halved) -> None:
     said = faults(covered, shares, dict.fromkeys(LIMBS, 5))
     assert any(text.startswith("LeftRing: ") for text in said)
     assert not any("Right" in text for text in said)
+
+
+def test_fingers_that_are_one_to_their_middle_are_no_fault(guide, halved) -> None:
+    surface, body = halved
+    found = guide.find(surface, body)
+    fused = {limb: np.clip(2 * along - 1, 0, None) for limb, along in found.along.items()}
+    shares = matches(body, surface, replace(found, along=fused), guide)
+    assert min(share.least for share in shares.values()) > MATCHED
+    gone = {limb: np.clip(6 * along - 5, 0, None) for limb, along in found.along.items()}
+    shares = matches(body, surface, replace(found, along=gone), guide)
+    assert max(share.wrap for share in shares.values()) < MATCHED
 
 
 @pytest.mark.parametrize(
