@@ -34,7 +34,7 @@ _OUTER = 0.3
 """Share of a digit's length from its base that may lie on its neighbour: where fingers begin is not sharp."""
 
 _FUSED = 0.6
-"""Share of a digit's length up to which it may lie where the skin has no digits: those of a scan, or of a hand
+"""Share of a digit's length up to which it may lie where the skin has no digits: those of scans, and of hands
 whose fingers touch, are one as far as that."""
 
 _SEGMENTS = (
