@@ -190,12 +190,9 @@ class Registry:
             generator = record.manager.hook.soma_generator(
                 spec=spec, device=device, dtype=dtype, options=given
             )
-            if isinstance(generator, type):
-                raise PluginError(
-                    f"soma_generator returned the class {generator.__name__}, expected an instance"
-                )
-            if not callable(getattr(generator, "rest", None)):
-                raise PluginError(f"soma_generator returned {type(generator).__name__} without a rest method")
+            if isinstance(generator, type) or not callable(getattr(generator, "rest", None)):
+                kind = f"{generator!r:.60}" if isinstance(generator, type) else type(generator).__name__
+                raise PluginError(f"soma_generator returned {kind}, no object with a rest method")
         record.state, record.error = "built", None
         return generator
 

@@ -37,6 +37,9 @@ _MOST_FACES = 50_000
 _WORTH = 0.7
 """Share of the faces from which on taking fewer is not worth it."""
 
+_FEW = 10
+"""Edges of the same kind that are no matter in a mesh of few faces: what decimates leaves some."""
+
 _TWISTED = 0.001
 """Share of the edges that may belong to three faces or be run through twice in one direction."""
 
@@ -224,7 +227,7 @@ def _check_surface(triangles: np.ndarray, *, allow_open: bool) -> None:
     _, uses = np.unique(np.sort(ends, 1), axis=0, return_counts=True)
     _, same = np.unique(ends, axis=0, return_counts=True)
     twisted = ((uses > 2).sum() + (same > 1).sum()) / len(uses)
-    if twisted > _TWISTED:
+    if twisted > max(_TWISTED, _FEW / len(uses)):
         raise _refusal(
             f"{twisted:.1%} of the edges between more than two faces, or faces turned against each other",
             "a surface with one side",

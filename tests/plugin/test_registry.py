@@ -223,7 +223,7 @@ def test_a_failing_build_is_tried_again() -> None:
 
 def test_a_generator_needs_a_rest_method() -> None:
     plugin = hooks(soma_backend=lambda: SOUND, soma_generator=lambda: "mesh")
-    with pytest.raises(BrokenBackendError, match="soma_generator returned str without a rest method"):
+    with pytest.raises(BrokenBackendError, match="soma_generator returned str no object with a rest method"):
         Registry([FakeEntryPoint("good", plugin)]).generator("good", **BUILD)
 
 

@@ -279,7 +279,7 @@ MUTANTS = (
     ),
     Mutant(
         "generator-builds",
-        "returned the class Specimen, expected an instance",
+        r"returned <class '\S*Specimen'>, no object with a rest method",
         _before_build("return Specimen"),
     ),
     Mutant("generator-shape", r"batch of 1: got \(\d+, 3\), expected a tensor", _rest("v.squeeze(0)")),
