@@ -64,12 +64,19 @@ def twisted(mesh):
     return replace(mesh, vertices=vertices)
 
 
-@pytest.fixture
-def small(mesh, twisted, monkeypatch):
+@pytest.fixture(scope="module")
+def small(mesh, twisted):
     """Both experiments on that mesh alone, so that they take seconds."""
-    for module in (table2_inversion, table3_regions):
-        monkeypatch.setattr(module, "anny_meshes", lambda count, seed: iter([mesh]))
-    monkeypatch.setattr(table2_inversion, "own_meshes", by_layer(mesh, twisted))
+    with pytest.MonkeyPatch.context() as patch:
+        for module in (table2_inversion, table3_regions):
+            patch.setattr(module, "anny_meshes", lambda count, seed: iter([mesh]))
+        patch.setattr(table2_inversion, "own_meshes", by_layer(mesh, twisted))
+        yield
+
+
+@pytest.fixture(scope="module")
+def table2(small):
+    return table2_inversion.run(configured())
 
 
 def by_layer(plain, default):
@@ -91,13 +98,12 @@ def test_smooth_motions_are_smooth_and_end_where_they_begin():
 
 
 @pytest.mark.slow
-def test_table2_lays_the_papers_rows_and_both_layers_side_by_side(small):
-    report = table2_inversion.run(configured())
-    assert not [figure for figure in report.failed if figure.name.startswith("plain, own meshes")]
-    assert {figure.name.partition(",")[0] for figure in report.figures} == {"default", "plain"}
-    text = report.as_markdown()
+def test_table2_lays_the_papers_rows_and_both_layers_side_by_side(table2):
+    assert not [figure for figure in table2.failed if figure.name.startswith("plain, own meshes")]
+    assert {figure.name.partition(",")[0] for figure in table2.figures} == {"default", "plain"}
+    text = table2.as_markdown()
     assert "| skeleton transfer only | 16.5 | 13.9 |  | 80.1 | 17,393 |" in text
-    own, native, each = report.tables[1:]
+    own, native, each = table2.tables[1:]
     assert [row[:2] for row in own.rows] == [
         ("gauss_newton", "default"),
         ("gauss_newton, ignoring twist and correctives", "default"),
@@ -105,13 +111,12 @@ def test_table2_lays_the_papers_rows_and_both_layers_side_by_side(small):
     ]
     assert [row[:2] for row in native.rows] == [("gauss_newton", "default"), ("gauss_newton", "plain")]
     assert [row[:2] for row in each.rows] == [("made here", "default"), ("made here", "plain")] * 2
-    assert json.loads(json.dumps(report.as_json()))["tables"][0]["rows"][1][:3] == ["analytical", 5.3, 3.2]
+    assert json.loads(json.dumps(table2.as_json()))["tables"][0]["rows"][1][:3] == ["analytical", 5.3, 3.2]
 
 
 @pytest.mark.slow
-def test_the_default_rows_fit_what_the_default_posed(small):
-    report = table2_inversion.run(configured())
-    through, ignoring = (row[2] for row in report.tables[1].rows[:2])
+def test_the_default_rows_fit_what_the_default_posed(table2):
+    through, ignoring = (row[2] for row in table2.tables[1].rows[:2])
     assert through < ignoring, "a fit that ignores twist joints and correctives misses what posed the mesh"
 
 

@@ -20,8 +20,8 @@ def supplied(tmp_path_factory) -> Path:
 
 
 @pytest.fixture
-def data_folder(supplied, tmp_path, monkeypatch) -> Path:
-    """SOMA_DATA_DIR with the files, and a cache of its own."""
+def data_folder(supplied, monkeypatch) -> Path:
+    """SOMA_DATA_DIR with the files; what is derived of them is made once for all tests."""
     monkeypatch.setenv("SOMA_DATA_DIR", str(supplied))
-    monkeypatch.setenv("SOMA_CACHE_DIR", str(tmp_path / "cache"))
+    monkeypatch.setenv("SOMA_CACHE_DIR", str(supplied.parent / "derived"))
     return supplied

@@ -31,11 +31,11 @@ NEAR_MM = 3.0
 
 
 @pytest.fixture(scope="module")
-def tools(supplied, tmp_path_factory):
+def tools(supplied):
     """Layer and fit of LOD 6, whose parameters are those of LOD 1, and the data folder meanwhile."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("SOMA_DATA_DIR", str(supplied))
-        patch.setenv("SOMA_CACHE_DIR", str(tmp_path_factory.mktemp("cache")))
+        patch.setenv("SOMA_CACHE_DIR", str(supplied.parent / "derived"))
         kind = {"options": TRUST, "lod": "low"}
         yield SomaLayer("mhr_lod6", **kind), ParameterFit("mhr_lod6", **kind)
 
