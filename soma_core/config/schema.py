@@ -178,7 +178,7 @@ class TrainCorrectivesConfig:
 
 @dataclass
 class Experiment:
-    """What an evaluation measures: on what backend, how many bodies or frames, which methods and files."""
+    """What an evaluation measures: backends and their options, how many bodies or frames, methods, files."""
 
     name: str = MISSING
     backend: str = MISSING
@@ -187,6 +187,7 @@ class Experiment:
     data: str | None = None
     checkpoint: str | None = None
     motions: list[str] = field(default_factory=list)
+    options: dict[str, Any] = field(default_factory=dict)
 
 
 @dataclass

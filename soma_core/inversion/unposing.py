@@ -15,7 +15,7 @@ from soma_core.inversion.result import InversionResult
 from soma_core.layer import SomaLayer
 from soma_core.skeleton.identity import Identity
 
-__all__ = ["Unposing"]
+__all__ = ["Unposing", "blended_turns", "posed_turns"]
 
 _REACH = 20.0
 """Changes are smoothed over this many times the distance by which the frames disagree on a vertex: over a
@@ -75,7 +75,7 @@ class Unposing:
 
         And the mean squared error (v,) [m^2] that is left: how far the frames disagree.
         """
-        turn = self._blends(identity, pose)
+        turn = posed_turns(self._layer, identity, pose)
         reached = pose.posed(self._layer, identity)
         away = torch.where(weights[..., None] > 0, (vertices - reached).transpose(0, 1).double(), 0.0)
         matrix = torch.einsum("vf,vfab,vfac->vbc", weights, turn, turn)
@@ -87,17 +87,24 @@ class Unposing:
         left = (away - (turn @ change[:, None]).squeeze(-1)).square().sum(-1)
         return change.squeeze(-1), (weights * left).sum(1) / total
 
-    def _blends(self, identity: Identity, pose: InversionResult) -> Tensor:
-        """Blended skinning rotations of every vertex in every frame, (v, F, 3, 3), by the public joints."""
-        animation, count = self._layer.animation, len(pose.rotations)
-        turns, places = animation.kinematics(
-            pose.rotations, animation.bone_vectors(identity), pose.translation
-        )
-        joints = skinning_transforms(turns, places, identity.bind_world)[..., :3].transpose(0, 1)
-        blends = sparse_product(animation.skinning.weights.csr, joints.flatten(1).contiguous())
-        return blends.view(-1, count, 3, 3).double()
-
     def _smoothed(self, change: np.ndarray, trust: np.ndarray) -> np.ndarray:
         """The change (v, 3) that keeps to `change` where `trust` (v,) is large, and is smooth elsewhere."""
         mass = self._areas * trust
         return splu((scipy.sparse.diags_array(mass) + self._bending).tocsc()).solve(mass[:, None] * change)
+
+
+def posed_turns(layer: SomaLayer, identity: Identity, pose: InversionResult) -> Tensor:
+    """Blended skinning rotations of every vertex in every frame, (v, F, 3, 3), by the public joints.
+
+    `identity` is one for all frames or one for each.
+    """
+    animation = layer.animation
+    turns, places = animation.kinematics(pose.rotations, animation.bone_vectors(identity), pose.translation)
+    return blended_turns(layer, skinning_transforms(turns, places, identity.bind_world))
+
+
+def blended_turns(layer: SomaLayer, transforms: Tensor) -> Tensor:
+    """What transforms (B, J, 3, 4) of the public joints turn each vertex by, (v, B, 3, 3) in float64."""
+    joints = transforms[..., :3].transpose(0, 1).flatten(1).contiguous()
+    blends = sparse_product(layer.animation.skinning.weights.csr, joints)
+    return blends.view(-1, len(transforms), 3, 3).double()

@@ -11,9 +11,9 @@ from soma_core.errors import InputError
 from soma_core.io.mesh_vertices import read_mesh_vertices
 from soma_core.io.vertex_sequence import VertexSequence
 
-__all__ = ["FolderSequence", "natural"]
+__all__ = ["MESH_SUFFIXES", "FolderSequence", "natural"]
 
-_SUFFIXES = (".obj", ".ply")
+MESH_SUFFIXES = (".obj", ".ply")
 
 
 class FolderSequence(VertexSequence):
@@ -28,7 +28,7 @@ class FolderSequence(VertexSequence):
     """
 
     def __init__(self, path: Path) -> None:
-        files = [file for file in path.iterdir() if file.suffix.lower() in _SUFFIXES]
+        files = [file for file in path.iterdir() if file.suffix.lower() in MESH_SUFFIXES]
         kinds = sorted({file.suffix.lower() for file in files})
         if len(kinds) != 1:
             raise InputError(

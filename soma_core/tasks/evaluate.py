@@ -20,7 +20,7 @@ _log = logging.getLogger(__name__)
 EXPERIMENTS = (
     "table1_topology", "table2_inversion", "table3_regions", "unknown_identity", "forward_path",
     "anny_reference", "sam3d_frames", "correctives", "twist_joints", "pose_angles",
-    "ground_contact", "points", "conversion_matrix",
+    "ground_contact", "points", "conversion_matrix", "shape_space",
 )  # fmt: skip
 """Modules of ``soma_core.evaluation`` with a function ``run(config) -> Report``."""
 
