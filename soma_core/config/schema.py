@@ -126,6 +126,7 @@ class CleanConfig(ModelOptions, CleanOptions):
 class TrainShapeConfig:
     """Configuration of ``soma train-shape``."""
 
+    shards: list[str] = field(default_factory=list)
     mix: dict[str, float] = field(default_factory=dict)
     options: dict[str, Any] = field(default_factory=dict)
     spread: float = 0.15
@@ -135,7 +136,8 @@ class TrainShapeConfig:
     batch: int = 256
     mirror: bool = True
     held_out: int = 200
-    resume: bool = False
+    save_every: int = 4
+    resume: bool = True
     seed: int = 0
     device: str = "cpu"
     out: str | None = None
@@ -170,7 +172,8 @@ class TrainCorrectivesConfig:
     patience: int = 8
     ridge: float = 1e-4
     mebibytes: float = 4.7
-    resume: bool = False
+    save_every: int = 500
+    resume: bool = True
     seed: int = 0
     device: str = "cpu"
     out: str | None = None

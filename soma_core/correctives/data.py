@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -19,7 +19,7 @@ from soma_core.errors import InputError
 from soma_core.rig.mesh import CanonicalMesh
 from soma_core.rig.skeleton import Rig
 
-__all__ = ["SPLITS", "Batch", "ClipPlan", "LessonStore", "Split", "plan_clips", "split_clips"]
+__all__ = ["SPLITS", "Batch", "ClipPlan", "LessonStore", "Split", "Taught", "split_clips"]
 
 Split = Literal["train", "validation", "test"]
 SPLITS: tuple[Split, ...] = ("train", "validation", "test")
@@ -29,57 +29,32 @@ _CM_PER_M = 100.0
 
 @dataclass(frozen=True, kw_only=True)
 class ClipPlan:
-    """Which clips there are.
+    """Which clips of random poses there are.
 
     Attributes:
         random_clips: clips of random poses.
         hanging_clips: clips of random poses with hanging arms.
         poses: poses in each of them.
-        motions: name -> rotations (n, J - 1, 3, 3) of motions, thinned out already.
         seed: of the random poses.
     """
 
     random_clips: int
     hanging_clips: int
     poses: int
-    motions: Mapping[str, np.ndarray]
     seed: int
 
+    def __len__(self) -> int:
+        """Number of clips."""
+        return self.random_clips + self.hanging_clips
 
-def plan_clips(plan: ClipPlan, names: Sequence[str]) -> list[Clip]:
-    """Make the clips: random ones, then motions.
-
-    Clip i depends on the seed and on i alone.
-
-    Raises:
-        InputError: fewer than three clips, which cannot be split.
-    """
-    clips = []
-    for kind, count in (("random", plan.random_clips), ("hanging", plan.hanging_clips)):
-        for index in range(count):
-            seed = [plan.seed, index] if kind == "random" else [plan.seed, index, 1]
-            random = np.random.default_rng(seed)
-            rotations = random_rotations(names, plan.poses, random, hanging=kind == "hanging")
-            number = index if kind == "random" else plan.random_clips + index
-            clips.append(Clip(name=f"{kind} {plan.seed}/{index}", rotations=rotations, seed=number))
-    for number, (name, rotations) in enumerate(plan.motions.items(), start=len(clips)):
-        clips.append(Clip(name=name, rotations=rotations, seed=number))
-    if len(clips) < len(SPLITS):
-        raise InputError(
-            "data",
-            got=f"{len(clips)} clips",
-            expected="at least 3: one to train on, one to stop by, one to test on",
-            fix="Raise data.random_clips, or name motions in data.motions.",
-        )
-    return clips
-
-
-def split_clips(clips: Sequence[Clip], *, held_out: float, seed: int) -> dict[Split, list[Clip]]:
-    """Split by clip: the share `held_out` each for validation and test, at least one clip."""
-    order = np.random.default_rng(seed).permutation(len(clips))
-    each = max(1, round(held_out * len(clips)))
-    parts = {"test": order[:each], "validation": order[each : 2 * each], "train": order[2 * each :]}
-    return {name: [clips[index] for index in sorted(parts[name])] for name in SPLITS}
+    def clip(self, number: int, names: Sequence[str]) -> Clip:
+        """Make a clip; it depends on the seed and on its number alone."""
+        hanging = number >= self.random_clips
+        index = number - self.random_clips if hanging else number
+        random = np.random.default_rng([self.seed, index, 1] if hanging else [self.seed, index])
+        rotations = random_rotations(names, self.poses, random, hanging=hanging)
+        kind = "hanging" if hanging else "random"
+        return Clip(name=f"{kind} {self.seed}/{index}", rotations=rotations, seed=number)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -99,6 +74,23 @@ class Batch:
         return Batch(features=self.features[chosen], offsets=self.offsets[chosen])
 
 
+@dataclass(frozen=True, kw_only=True)
+class Taught:
+    """A clip whose lesson a store holds, without its poses.
+
+    Attributes:
+        name: of the clip.
+        part_of: clips with one such name stay together when data is split.
+        key: of the lesson.
+        poses: how many there are.
+    """
+
+    name: str
+    part_of: str
+    key: str
+    poses: int
+
+
 class LessonStore:
     """Lessons on disk, taught when they are first needed; offsets in half precision, centimetres.
 
@@ -114,26 +106,26 @@ class LessonStore:
         self._names, self._mirror = rig.user_joint_names, mesh.mirror
         self._features = PoseFeatures(rig, dtype=torch.float32, device="cpu")
 
-    def _path(self, clip: Clip) -> Path:
-        return self._folder / f"{content_key(clip.name, clip.seed, clip.rotations)}.npz"
+    def _path(self, key: str) -> Path:
+        return self._folder / f"{key}.npz"
 
-    def missing(self, clips: Iterable[Clip]) -> list[Clip]:
-        """Those that have yet to be taught."""
-        return [clip for clip in clips if not self._path(clip).is_file()]
+    def teach(self, clip: Clip) -> Taught:
+        """Teach one clip and keep the lesson, unless it was kept before."""
+        key = content_key(clip.name, clip.seed, clip.rotations)
+        if not self._path(key).is_file():
+            lesson = self._teacher.teach(clip)
+            rotations = lesson.rotations.astype(np.float32)
+            offsets = (_CM_PER_M * lesson.offsets).astype(np.float16)
+            atomic_write(self._path(key), lambda path: np.savez(path, rotations=rotations, offsets=offsets))
+        part_of = clip.part_of or clip.name
+        return Taught(name=clip.name, part_of=part_of, key=key, poses=len(clip.rotations))
 
-    def teach(self, clip: Clip) -> None:
-        """Teach one clip and keep the lesson."""
-        lesson = self._teacher.teach(clip)
-        rotations = lesson.rotations.astype(np.float32)
-        offsets = (_CM_PER_M * lesson.offsets).astype(np.float16)
-        atomic_write(self._path(clip), lambda path: np.savez(path, rotations=rotations, offsets=offsets))
-
-    def read(self, clip: Clip, vertices: np.ndarray, *, mirrored: bool = False) -> Batch:
+    def read(self, clip: Taught, vertices: np.ndarray, *, mirrored: bool = False) -> Batch:
         """The lesson of a clip for some vertices; `mirrored` adds the mirror image of every pose.
 
         The canonical body is symmetric, so the offsets of a mirrored pose are those of the partners.
         """
-        with np.load(self._path(clip), allow_pickle=False) as file:
+        with np.load(self._path(clip.key), allow_pickle=False) as file:
             rotations, offsets = file["rotations"], file["offsets"]
         kept = [offsets[:, vertices]]
         if mirrored:
@@ -144,7 +136,7 @@ class LessonStore:
 
     def batches(
         self,
-        clips: Sequence[Clip],
+        clips: Sequence[Taught],
         size: int,
         random: np.random.Generator,
         vertices: np.ndarray,
@@ -176,3 +168,24 @@ def _joined(batches: Sequence[Batch]) -> Batch:
         features=torch.cat([batch.features for batch in batches]),
         offsets=torch.cat([batch.offsets for batch in batches]),
     )
+
+
+def split_clips(clips: Sequence[Taught], *, held_out: float, seed: int) -> dict[Split, list[Taught]]:
+    """Split by clip: the share `held_out` each for validation and test, at least one clip.
+
+    Raises:
+        InputError: fewer than three clips, which cannot be split.
+    """
+    whole = list(dict.fromkeys(clip.part_of for clip in clips))
+    if len(whole) < len(SPLITS):
+        raise InputError(
+            "data",
+            got=f"{len(whole)} clips",
+            expected="at least 3: one to train on, one to stop by, one to test on",
+            fix="Raise data.random_clips, or name motions in data.motions.",
+        )
+    order = np.random.default_rng(seed).permutation(len(whole))
+    each = max(1, round(held_out * len(whole)))
+    parts = {"test": order[:each], "validation": order[each : 2 * each], "train": order[2 * each :]}
+    homes = {whole[index]: name for name, part in parts.items() for index in part}
+    return {name: [clip for clip in clips if homes[clip.part_of] == name] for name in SPLITS}

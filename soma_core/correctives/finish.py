@@ -10,11 +10,10 @@ import numpy as np
 import scipy.sparse
 import torch
 
-from soma_core.correctives.data import LessonStore
+from soma_core.correctives.data import LessonStore, Taught
 from soma_core.correctives.features import local_bind_rotations
 from soma_core.correctives.network import CorrectivesNetwork
 from soma_core.correctives.second_stage import accumulate, all_entries, pruned, to_matrix
-from soma_core.correctives.teacher import Clip
 from soma_core.correctives.weights import CorrectiveWeights
 from soma_core.errors import InputError
 from soma_core.rig.skeleton import Rig
@@ -57,7 +56,7 @@ def finished(
     network: CorrectivesNetwork,
     masks: Masks,
     store: LessonStore,
-    clips: Sequence[Clip],
+    clips: Sequence[Taught],
     rig: Rig,
     *,
     ridge: float,

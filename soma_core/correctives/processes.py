@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from typing import TypeVar, cast
 
 import torch
 import torch.distributed as dist
 from torch import Tensor
 
 __all__ = ["Processes", "joined_processes"]
+
+T = TypeVar("T")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -37,9 +40,41 @@ class Processes:
         if self.count > 1:
             dist.barrier()
 
-    def wrapped(self, module: torch.nn.Module) -> torch.nn.Module:
-        """The module, averaging gradients where there are several processes."""
-        return torch.nn.parallel.DistributedDataParallel(module) if self.count > 1 else module
+    def average(self, parameters: Iterable[torch.nn.Parameter]) -> None:
+        """Set gradients to their mean over all processes.
+
+        Not by ``DistributedDataParallel``, which packs them in another way after its first step: a run that
+        goes on would add up in another order.
+        """
+        for parameter in parameters if self.count > 1 else ():
+            assert parameter.grad is not None
+            self.total(parameter.grad)
+            parameter.grad /= self.count
+
+    def spread(self, parameters: Iterable[torch.nn.Parameter]) -> None:
+        """Give all processes the numbers of the first."""
+        for parameter in parameters if self.count > 1 else ():
+            dist.broadcast(parameter.data, 0)
+
+    def gathered(self, value: T) -> list[T]:
+        """What every process has, in the order of their ranks."""
+        found: list[T | None] = [value] * self.count
+        if self.count > 1:
+            dist.all_gather_object(found, value)
+        return cast(list[T], found)
+
+    def brought(self, values: Tensor | None, shape: Sequence[int], *, rank: int) -> Tensor | None:
+        """Bring float64 `values` of one process to the first; None on the others."""
+        if rank == 0:
+            return values if self.rank == 0 else None
+        if self.rank == rank:
+            assert values is not None
+            dist.send(values.contiguous(), 0)
+        if self.rank > 0:
+            return None
+        found = torch.empty(*shape, dtype=torch.float64)
+        dist.recv(found, rank)
+        return found
 
 
 @contextmanager

@@ -26,11 +26,13 @@ class Clip:
         name: unique; where the poses come from.
         rotations: T-pose-relative (n, J - 1, 3, 3).
         seed: of a teacher that draws poses of its own model instead, as many as there are rotations.
+        part_of: name of the longer clip that it is a piece of; empty where it is whole.
     """
 
     name: str
     rotations: np.ndarray
     seed: int = 0
+    part_of: str = ""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

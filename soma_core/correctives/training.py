@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import itertools
 import logging
 import math
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, Protocol, TypedDict
@@ -13,11 +14,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from soma_core.correctives.data import Batch, LessonStore
+from soma_core.correctives.data import Batch, LessonStore, Taught
 from soma_core.correctives.network import CorrectivesNetwork
 from soma_core.correctives.processes import Processes
 from soma_core.correctives.second_stage import accumulate, all_entries, solve
-from soma_core.correctives.teacher import Clip
 from soma_core.correctives.weights import write_tensors
 from soma_core.errors import InputError
 from soma_core.stored_matrix import StoredMatrix
@@ -46,6 +46,7 @@ class TrainingOptions:
         ridge: of the closed-form second stage; see :func:`second_stage.solve`.
         mirror: learn from the mirror image of every pose as well.
         seed: of the first weights and the order of the poses.
+        save_every: batches between two saved states; one is saved after every epoch as well.
     """
 
     batch: int = 64
@@ -56,6 +57,7 @@ class TrainingOptions:
     ridge: float = 1e-4
     mirror: bool = True
     seed: int = 0
+    save_every: int = 500
 
 
 class Epoch(TypedDict):
@@ -109,9 +111,11 @@ def reduction(
 
 @dataclass
 class _State:
-    """All that the next epoch depends on, with the network and the optimiser."""
+    """All that the next batch depends on, with the network and the optimiser: `batch` in the `epoch`."""
 
     epoch: int = 0
+    batch: int = 0
+    squared: float = 0.0
     best: float = math.inf
     best_epoch: int = 0
     history: list[Epoch] = field(default_factory=list)
@@ -137,14 +141,14 @@ class Trainer:
         network: CorrectivesNetwork,
         store: LessonStore,
         *,
-        train: Sequence[Clip],
-        validation: Sequence[Clip],
+        train: Sequence[Taught],
+        validation: Sequence[Taught],
         vertices: np.ndarray,
         options: TrainingOptions,
         processes: Processes | None = None,
     ) -> None:
         self.processes = processes or Processes()
-        poses = sum(len(clip.rotations) for clip in train)
+        poses = sum(clip.poses for clip in train)
         if options.batch < 1 or options.batch > poses or options.batch % self.processes.count:
             raise InputError(
                 "batch",
@@ -155,7 +159,6 @@ class Trainer:
         self.network, self._store, self._options = network, store, options
         self._train, self._validation, self._vertices = train, validation, vertices
         self._device = network.first.device
-        self._wrapped = self.processes.wrapped(network)
         self._optimiser = torch.optim.Adam(network.parameters(), lr=options.rate, betas=(0.9, 0.99))
         self._state, self._best = _State(), _copied(network)
 
@@ -188,47 +191,56 @@ class Trainer:
         """Train to the end; the network holds the best weights afterwards.
 
         Args:
-            state: file that holds everything between epochs; removed at the end.
+            state: file that holds everything between batches; removed at the end.
             key: identifies the run; a state of another run is not taken up.
             resume: go on from `state`; the result equals that of an uninterrupted run to the last bit.
             progress: shows the epochs.
         """
-        if not (resume and self._restore(state, key)):
+        found = resume and self._restore(state, key)
+        self.processes.wait()  # all have read the state before it is written again
+        if not found:
             self.warm_start()
+        self.processes.spread(self.network.parameters())
         for epoch in progress(range(self._state.epoch, self._options.epochs), self._state.epoch):
             if self._state.epoch - self._state.best_epoch >= self._options.patience:
                 break
-            self._history_line(epoch, self._epoch(epoch))
-            if self.processes.rank == 0:
-                self._save(state, key)
+            self._history_line(epoch, self._epoch(epoch, lambda: self._save(state, key)))
+            self._save(state, key)
         self.network.load_state_dict(self._best)
         self.processes.wait()
         state.unlink(missing_ok=True)
 
-    def _epoch(self, epoch: int) -> float:
-        """One pass over the training poses; the root mean square error [mm] on the way."""
-        options = self._options
+    def _epoch(self, epoch: int, save: Callable[[], None]) -> float:
+        """What is left of one pass over the training poses; the root mean square error [mm] on the way."""
+        options, state = self._options, self._state
         rate = options.rate * 0.5 * (1 + math.cos(math.pi * epoch / options.epochs))
         for group in self._optimiser.param_groups:
             group["lr"] = rate
         share = options.batch // self.processes.count
         part = slice(self.processes.rank * share, (self.processes.rank + 1) * share)
-        squared, steps = torch.zeros(1, device=self._device), 0
+        squared = torch.zeros((), dtype=torch.float64, device=self._device)
         random = np.random.default_rng([options.seed, epoch])
         batches = self._store.batches(
             self._train, options.batch, random, self._vertices, mirrored=options.mirror
         )
-        for batch in batches:
+        for batch in itertools.islice(batches, state.batch, None):
             seen, wanted = self._tensors(batch.part(part))
-            error = _MM2_PER_CM2 * (self._wrapped(seen) - wanted).square().sum(-1).mean()
+            error = _MM2_PER_CM2 * (self.network(seen) - wanted).square().sum(-1).mean()
             length = self.network.masked_second().square().sum(-1).add(1e-12).sqrt().mean()
             self._optimiser.zero_grad(set_to_none=True)
             (error + options.sparsity * length).backward()
+            self.processes.average(self.network.parameters())
             self._optimiser.step()
             squared += error.detach()
-            steps += 1
-        mean = self.processes.total(squared.cpu()) / self.processes.count / max(steps, 1)
-        return float(mean.sqrt())
+            state.batch += 1
+            if state.batch % options.save_every == 0:
+                state.squared += float(self.processes.total(squared.cpu()))
+                squared.zero_()
+                save()
+        state.squared += float(self.processes.total(squared.cpu()))
+        mean = state.squared / self.processes.count / max(state.batch, 1)
+        state.squared, state.batch = 0.0, 0
+        return math.sqrt(mean)
 
     def _history_line(self, epoch: int, train: float) -> None:
         share, left = self.validate()
@@ -253,7 +265,7 @@ class Trainer:
         )
         return reduction(pairs, self.processes)
 
-    def _share(self, clips: Sequence[Clip], *, mirrored: bool = False) -> Iterator[tuple[Tensor, Tensor]]:
+    def _share(self, clips: Sequence[Taught], *, mirrored: bool = False) -> Iterator[tuple[Tensor, Tensor]]:
         """Features and offsets [cm] of this process's share of the clips, clip by clip."""
         for clip in clips[self.processes.rank :: self.processes.count]:
             yield self._tensors(self._store.read(clip, self._vertices, mirrored=mirrored))
@@ -262,6 +274,8 @@ class Trainer:
         return batch.features.to(self._device), _CM_PER_M * batch.offsets.to(self._device)
 
     def _save(self, path: Path, key: str) -> None:
+        if self.processes.rank > 0:
+            return
         content: dict[str, Any] = {
             "key": key,
             "state": asdict(self._state),
@@ -273,7 +287,6 @@ class Trainer:
 
     def _restore(self, path: Path, key: str) -> bool:
         if not path.is_file():
-            _log.warning("no saved state of this run at %s; starting from the beginning", path)
             return False
         # Sizes are checked before torch takes memory for them.
         read_tensor_archive(path, fix="Delete it to start over.", sparse=StoredMatrix.csr)
@@ -284,7 +297,7 @@ class Trainer:
         self.network.load_state_dict(content["network"])
         self._optimiser.load_state_dict(content["optimiser"])
         self._state, self._best = _State(**content["state"]), content["best"]
-        _log.info("going on after epoch %d", self._state.epoch)
+        _log.info("going on after epoch %d and %d batches", self._state.epoch, self._state.batch)
         return True
 
 

@@ -147,7 +147,7 @@ class LinearSpace:
         independent = sizes > _DEPENDENT * sizes[0]
         self.rank = int(independent.sum()) - 3
         self._directions = directions[:, independent]
-        self._everywhere = moved @ (turn[independent] / sizes[independent, None]).T
+        self._hidden = moved[~self._rows] @ (turn[independent] / sizes[independent, None]).T
         self._fit = PoseInversion(layer, skinning="plain")
 
     def project(self, bodies: Tensor) -> tuple[np.ndarray, Tensor]:
@@ -185,7 +185,10 @@ class LinearSpace:
     def _nearest(self, shapes: Tensor) -> Tensor:
         """The bodies of the space that are nearest to some, (b, v, 3) [m]."""
         coefficients = (shapes.flatten(1) - self._template)[:, self._rows] @ self._directions
-        return (self._template + coefficients @ self._everywhere.T).view(shapes.shape)
+        found = self._template.repeat(len(shapes), 1)
+        found[:, self._rows] += coefficients @ self._directions.T
+        found[:, ~self._rows] += coefficients @ self._hidden.T
+        return found.view(shapes.shape)
 
     def _in_pose_of(self, identity: Identity, shapes: Tensor) -> Tensor:
         """Bodies posed as `shapes` (b, v, 3) [m] are, by the skeletons of both."""

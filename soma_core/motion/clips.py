@@ -27,8 +27,8 @@ if TYPE_CHECKING:
     import pyarrow as pa
 
 __all__ = [
-    "LONGEST", "Clips", "clip_file", "clip_rows", "clip_schema", "need_pyarrow", "refused", "row_tables",
-    "write_rows",
+    "LONGEST", "Clips", "clip_file", "clip_rows", "clip_schema", "need_pyarrow", "refused", "row_array",
+    "row_tables", "write_rows",
 ]  # fmt: skip
 
 LONGEST = 36_864
@@ -172,7 +172,7 @@ def clip_file(row: Mapping[str, Any], name: str, folder: Path) -> tuple[str, Pat
         content, path = row["bytes"][0].as_py() or b"", folder / stem
         atomic_write(path, lambda place: place.write_bytes(content))
     else:
-        arrays = {key: _array(name, key, column) for key, column in row.items() if column[0].is_valid}
+        arrays = {key: row_array(name, key, column) for key, column in row.items() if column[0].is_valid}
         path = folder / (stem if stem.lower().endswith(".npz") else f"{stem}.npz")
         atomic_arrays(path, arrays, compressed=False)
     # A fit knows its file again by the time of change: here that follows from the content.
@@ -181,7 +181,7 @@ def clip_file(row: Mapping[str, Any], name: str, folder: Path) -> tuple[str, Pat
     return name, path
 
 
-def _array(name: str, key: str, column: pa.Array) -> np.ndarray:
+def row_array(name: str, key: str, column: pa.Array) -> np.ndarray:
     """The one entry of a column."""
     pa = need_pyarrow()
     if isinstance(column, pa.ExtensionArray):  # Ray's tensors

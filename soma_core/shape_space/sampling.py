@@ -10,7 +10,9 @@ import numpy as np
 from soma_core.errors import InputError
 from soma_core.plugin.spec import BackendSpec, Parameter
 
-__all__ = ["HELD_OUT", "TRAINING", "IdentityLayer", "IdentityStream", "sample_parameters"]
+__all__ = [
+    "HELD_OUT", "TRAINING", "IdentityLayer", "IdentityStream", "ShapeStream", "sample_parameters", "standing",
+]  # fmt: skip
 
 TRAINING, HELD_OUT = 0, 1
 """Streams of identities that never share a random number."""
@@ -53,6 +55,14 @@ def sample_parameters(
         return np.clip(random.normal(0.0, deviation, size), low, high)
 
     return {item.name: draw(item) for item in spec.params if item.group not in skip_groups}
+
+
+class ShapeStream(Protocol):
+    """Where shapes come from: batch `b` does not depend on which were asked for before."""
+
+    def shapes(self, stream: int, batch: int, count: int) -> np.ndarray:
+        """Rest shapes [cm], (count, v, 3) float64: bind pose, lowest vertex at height zero."""
+        ...
 
 
 class IdentityStream:
@@ -110,10 +120,7 @@ class IdentityStream:
             for name, number in zip(self._layers, counts, strict=True)
             if number
         ]
-        shapes = np.concatenate(parts)
-        # Where a model has its origin says nothing about shape: stand everybody on the floor.
-        shapes[..., 1] -= shapes[..., 1].min(axis=1, keepdims=True)
-        return shapes
+        return standing(np.concatenate(parts))
 
     def _one_backend(self, name: str, count: int, random: np.random.Generator) -> np.ndarray:
         layer = self._layers[name]
@@ -127,8 +134,18 @@ class IdentityStream:
                 rest = layer.identity(chunk).rest.detach().cpu().numpy()
             except InputError as error:
                 raise _refused(error, name, layer.spec) from error
-            parts.append(_CM_PER_M * rest.astype(np.float64))
+            parts.append(rest)
         return np.concatenate(parts)
+
+
+def standing(rest: np.ndarray) -> np.ndarray:
+    """Rest shapes (count, v, 3) [m] in centimetres and float64, their lowest vertex at height zero.
+
+    Where a model has its origin says nothing about shape.
+    """
+    shapes = _CM_PER_M * rest.astype(np.float64)
+    shapes[..., 1] -= shapes[..., 1].min(axis=1, keepdims=True)
+    return shapes
 
 
 def _refused(error: InputError, backend: str, spec: BackendSpec) -> InputError:

@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
+import torch
 
 from soma_core._lazy import needed
 from soma_core.cache import atomic_arrays
+from soma_core.correctives.processes import Processes
 from soma_core.errors import InputError
-from soma_core.shape_space.sampling import TRAINING, IdentityStream
+from soma_core.shape_space.sampling import TRAINING, ShapeStream
 
 if TYPE_CHECKING:
     from sklearn.decomposition import IncrementalPCA
@@ -98,7 +100,7 @@ class Components:
 
 
 def train_components(
-    stream: IdentityStream,
+    stream: ShapeStream,
     plan: TrainingPlan,
     *,
     bind: np.ndarray,
@@ -107,8 +109,12 @@ def train_components(
     key: str,
     resume: bool = False,
     progress: Callable[[Iterable[int], int], Iterable[int]] = lambda steps, _done: steps,
-) -> Components:
+    processes: Processes | None = None,
+) -> Components | None:
     """Run incremental PCA over the training stream.
+
+    Several processes take turns at making batches; the first takes them up in order, so that the result is
+    the same for any number, and is alone in having one: None elsewhere.
 
     Args:
         stream: supply of shapes [cm].
@@ -122,15 +128,21 @@ def train_components(
     sklearn = needed("sklearn", "decomposition", setting="task train-shape", pip="[train]")
     rows = plan.batch_sizes[0] * (2 if plan.mirror else 1)
     pca = sklearn.decomposition.IncrementalPCA(min(plan.components + _EXTRA_COMPONENTS, rows, bind.size))
+    processes = processes or Processes()
     done = _restore(pca, state, key) if resume else 0
+    processes.wait()  # all have read the state before it is written again
     sizes = plan.batch_sizes
-    for number in progress(range(done, len(sizes)), done):
-        shapes = stream.shapes(TRAINING, number, sizes[number])
+    made = _made(stream, sizes, done, bind.shape, processes)
+    for number, shapes in zip(progress(range(done, len(sizes)), done), made, strict=True):
+        if shapes is None:
+            continue
         if plan.mirror:
             shapes = np.concatenate((shapes, mirror_shapes(shapes, bind, partner)))
         pca.partial_fit(shapes.reshape(len(shapes), -1))
         if (number + 1) % plan.save_every == 0 and number + 1 < len(sizes):
             _save(pca, state, key, number + 1)
+    if processes.rank > 0:
+        return None
     state.unlink(missing_ok=True)
     kept = slice(plan.components)
     return Components(
@@ -142,6 +154,20 @@ def train_components(
     )
 
 
+def _made(
+    stream: ShapeStream, sizes: Sequence[int], done: int, shape: tuple[int, ...], processes: Processes
+) -> Iterator[np.ndarray | None]:
+    """Batches from number `done` on, in order, on the first process; None for each on the others."""
+    for start in range(done, len(sizes), processes.count):
+        own = start + processes.rank
+        shapes = None
+        if own < len(sizes):
+            shapes = torch.from_numpy(stream.shapes(TRAINING, own, sizes[own]))
+        for rank, number in enumerate(range(start, min(start + processes.count, len(sizes)))):
+            brought = processes.brought(shapes, (sizes[number], *shape), rank=rank)
+            yield None if brought is None else brought.numpy()
+
+
 def _save(pca: IncrementalPCA, state: Path, key: str, done: int) -> None:
     arrays = {name: np.asarray(getattr(pca, name)) for name in _FITTED}
     atomic_arrays(state, {"key": np.array(key), "done": np.array(done)} | arrays, compressed=False)
@@ -150,7 +176,6 @@ def _save(pca: IncrementalPCA, state: Path, key: str, done: int) -> None:
 def _restore(pca: IncrementalPCA, state: Path, key: str) -> int:
     """Put the saved state into `pca`; return the number of batches it has seen, 0 without a state."""
     if not state.is_file():
-        _log.warning("no saved state of this run at %s; starting from the beginning", state)
         return 0
     with np.load(state, allow_pickle=False) as saved:
         if str(saved["key"]) != key:

@@ -4,17 +4,18 @@ from __future__ import annotations
 
 import json
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 from omegaconf import DictConfig, OmegaConf
+from scipy.spatial.transform import Rotation
 
 from soma_core._version import __version__
 from soma_core.cache import atomic_write, content_key
-from soma_core.correctives.data import ClipPlan, LessonStore, Split, plan_clips, split_clips
+from soma_core.correctives.data import ClipPlan, LessonStore, Split, Taught, split_clips
 from soma_core.correctives.finish import Masks, entry_budget, finished
 from soma_core.correctives.masks import find_creases, joint_mask, vertex_mask
 from soma_core.correctives.model import Correctives
@@ -26,6 +27,7 @@ from soma_core.correctives.training import Trainer, TrainingOptions, reduction
 from soma_core.correctives.weights import CorrectiveWeights, read_weights, write_weights
 from soma_core.errors import InputError
 from soma_core.io import read_motion
+from soma_core.motion.clip_stream import ClipStream, shard_files
 from soma_core.paths import cache_dir
 from soma_core.progress import progress
 from soma_core.rig import load_canonical
@@ -34,12 +36,15 @@ from soma_core.rig.mesh import CanonicalMesh
 from soma_core.rig.skeleton import Rig
 from soma_core.topology.lod_transfer import offset_rows
 
-__all__ = ["make_teacher", "read_motions", "run"]
+__all__ = ["make_teacher", "read_clips", "run"]
 
 _log = logging.getLogger(__name__)
 
 _CODE_VERSION = 1
-_OPTIONS = ("batch", "epochs", "rate", "sparsity", "patience", "ridge", "seed")
+_OPTIONS = ("batch", "epochs", "rate", "sparsity", "patience", "ridge", "seed", "save_every")
+
+_LONGEST, _SAID = 256, 20
+"""Poses of a clip at most, and clips between two lines of the log while they are taught."""
 
 
 def run(config: DictConfig, output: Path) -> None:
@@ -53,15 +58,16 @@ def run(config: DictConfig, output: Path) -> None:
         InputError: data, an option or a teacher that cannot be used.
         BackendError: the teacher's backend is not usable.
     """
+    _check(config.data)
     mesh, rig = load_canonical("mid")
     options = TrainingOptions(mirror=config.data.mirror, **{name: config[name] for name in _OPTIONS})
     masks = _masks(mesh, rig, config.reach)
     budget = entry_budget(config.mebibytes, masks, config.channels)
-    clips = _clips(config, rig)
     with joined_processes(config.device) as processes:
         teacher = make_teacher(config.teacher, mesh, rig)
         store = LessonStore(cache_dir() / "train_correctives" / "lessons", teacher, mesh, rig)
-        _teach(store, [clip for part in clips.values() for clip in part], processes)
+        taught = _taught(store, config, rig, processes)
+        clips = split_clips(taught, held_out=config.data.held_out, seed=config.seed)
         trainer, network = _trained(config, options, masks, store, clips, processes)
         if processes.rank > 0:
             return
@@ -93,32 +99,59 @@ def make_teacher(name: str, mesh: CanonicalMesh, rig: Rig) -> Teacher:
     return PosedTeacher(name)
 
 
-def read_motions(paths: Sequence[str], step: int) -> dict[str, np.ndarray]:
-    """Every `step`-th frame of motion files, or of all motion files in folders; file -> rotations.
+def read_clips(data: DictConfig, seed: int, names: Sequence[str], processes: Processes) -> Iterator[Clip]:
+    """The clips that this process teaches, one in memory at a time: random ones, motion files, and shards.
+
+    Of motions every ``data.step``-th frame, in pieces. All processes together read each clip once.
 
     Raises:
-        InputError: a step below one, or absolute rotations.
+        InputError: absolute rotations, or shards that cannot be used.
         AssetError: a file that cannot be read.
     """
-    if step < 1:
-        raise InputError("data.step", got=step, expected="at least 1", fix="Take every frame with step=1.")
-    files = [
-        file
-        for path in map(Path, paths)
-        for file in (sorted(path.glob("*.npz")) if path.is_dir() else [path])
-    ]
-    found = {}
-    for file in files:
-        motion = read_motion(file)
-        if motion.convention != "t_pose_relative":
-            raise InputError(
-                "data.motions",
-                got=f"{file} with the convention {motion.convention}",
-                expected="rotations relative to the T-pose",
-                fix="Convert it with `soma convert`.",
-            )
-        found[file.name] = motion.rotations[::step]
-    return found
+    rank, count = processes.rank, processes.count
+    plan = ClipPlan(
+        random_clips=data.random_clips, hanging_clips=data.hanging_clips, poses=data.poses, seed=seed
+    )
+    for number in range(rank, len(plan), count):
+        yield plan.clip(number, names)
+    shards = [path for path in data.motions if shard_files(path)]
+    paths = [Path(path) for path in data.motions if path not in shards]
+    files = [file for path in paths for file in (sorted(path.glob("*.npz")) if path.is_dir() else [path])]
+    for number in range(rank, len(files), count):
+        motion = read_motion(files[number])
+        _check_convention(files[number], motion.convention)
+        rotations = motion.rotations[:: data.step]
+        yield from _pieces(files[number].name, "", rotations, len(plan) + number)
+    if not shards:
+        return
+    columns = ["name", "state", "start", "convention", "poses"]
+    for row in ClipStream(shards, columns, seed=None, setting="data.motions").share(rank, count):
+        if row["state"] != "converted" or "poses" not in row:
+            continue
+        _check_convention(row["name"], row["convention"])
+        vectors = row["poses"][-row["start"] % data.step :: data.step].astype(np.float64)
+        rotations = Rotation.from_rotvec(vectors.reshape(-1, 3)).as_matrix()
+        number = len(plan) + len(files) + row["row"]
+        yield from _pieces(row["name"], f" {row['start']}", rotations.reshape(-1, 77, 3, 3), number)
+
+
+def _pieces(name: str, at: str, rotations: np.ndarray, number: int) -> Iterator[Clip]:
+    """A clip, in pieces of so many poses that a few of them fit into memory."""
+    starts = range(0, len(rotations), _LONGEST)
+    for start in starts:
+        piece = f"{name}{at}" + (f"/{start}" if len(starts) > 1 else "")
+        poses = rotations[start : start + _LONGEST]
+        yield Clip(name=piece, rotations=poses, seed=number, part_of=name)
+
+
+def _check_convention(name: str | Path, convention: str) -> None:
+    if convention != "t_pose_relative":
+        raise InputError(
+            "data.motions",
+            got=f"{name} with the convention {convention}",
+            expected="rotations relative to the T-pose",
+            fix="Convert it with `soma convert`.",
+        )
 
 
 def _masks(mesh: CanonicalMesh, rig: Rig, reach: float) -> Masks:
@@ -128,31 +161,26 @@ def _masks(mesh: CanonicalMesh, rig: Rig, reach: float) -> Masks:
     return Masks(joints=joint_mask(rig, creases), vertices=vertex_mask(mesh, rig, creases, reach=reach))
 
 
-def _clips(config: DictConfig, rig: Rig) -> Mapping[Split, Sequence[Clip]]:
-    data = config.data
+def _check(data: DictConfig) -> None:
     if not 0 < data.held_out < 0.5:
         raise InputError(
             "data.held_out", got=data.held_out, expected="above 0 and below 0.5", fix="Try data.held_out=0.1."
         )
-    plan = ClipPlan(
-        random_clips=data.random_clips,
-        hanging_clips=data.hanging_clips,
-        poses=data.poses,
-        motions=read_motions(data.motions, data.step),
-        seed=config.seed,
-    )
-    clips = plan_clips(plan, rig.user_joint_names)
-    return split_clips(clips, held_out=data.held_out, seed=config.seed)
+    if data.step < 1:
+        raise InputError(
+            "data.step", got=data.step, expected="at least 1", fix="Take every frame with step=1."
+        )
 
 
-def _teach(store: LessonStore, clips: Sequence[Clip], processes: Processes) -> None:
-    """Fill the cache; every process takes its share of what is missing."""
-    missing = store.missing(clips)
-    processes.wait()  # all have looked before one begins to write
-    own = missing[processes.rank :: processes.count]
-    for clip in progress(own, label="teaching, clip", total=len(own)):
-        store.teach(clip)
-    processes.wait()
+def _taught(store: LessonStore, config: DictConfig, rig: Rig, processes: Processes) -> list[Taught]:
+    """Fill the cache, each process with its share; give all clips, in an order that no process decides."""
+    own = []
+    for clip in read_clips(config.data, config.seed, rig.user_joint_names, processes):
+        own.append((clip.seed, len(own), store.teach(clip)))
+        if len(own) % _SAID == 0:
+            _log.info("%d clips taught", len(own))
+    found = sorted(each for part in processes.gathered(own) for each in part)
+    return [taught for _, _, taught in found]
 
 
 def _trained(
@@ -160,7 +188,7 @@ def _trained(
     options: TrainingOptions,
     masks: Masks,
     store: LessonStore,
-    clips: Mapping[Split, Sequence[Clip]],
+    clips: Mapping[Split, Sequence[Taught]],
     processes: Processes,
 ) -> tuple[Trainer, CorrectivesNetwork]:
     """Train both stages on the vertices of ``config.lod``."""
@@ -172,7 +200,7 @@ def _trained(
         network, store, train=clips["train"], validation=clips["validation"], vertices=vertices,
         options=options, processes=processes,
     )  # fmt: skip
-    named = [[clip.name for clip in clips[part]] for part in clips]
+    named = [[clip.key for clip in clips[part]] for part in clips]
     shape = (config.channels, config.reach, str(config.lod), processes.count, config.device)
     key = content_key(_CODE_VERSION, str(options), str(shape), json.dumps(named), store.key)
     trainer.run(
@@ -191,7 +219,7 @@ def _training_vertices(config: DictConfig) -> np.ndarray:
 
 
 def _tested(
-    weights: CorrectiveWeights, store: LessonStore, clips: Sequence[Clip], mesh: CanonicalMesh, rig: Rig
+    weights: CorrectiveWeights, store: LessonStore, clips: Sequence[Taught], mesh: CanonicalMesh, rig: Rig
 ) -> dict[str, float]:
     """How well the written file does on clips that had no part in training."""
     model = Correctives(weights, rig, offset_rows(mesh), dtype=torch.float32, device="cpu")
@@ -202,7 +230,7 @@ def _tested(
 
 
 def _provenance(
-    config: DictConfig, teacher: Teacher, clips: Mapping[Split, Sequence[Clip]], mesh: CanonicalMesh
+    config: DictConfig, teacher: Teacher, clips: Mapping[Split, Sequence[Taught]], mesh: CanonicalMesh
 ) -> dict[str, Any]:
     settings = {name: config[name] for name in (*_OPTIONS, "channels", "reach", "mebibytes")}
     return {
@@ -211,8 +239,8 @@ def _provenance(
         "version": __version__,
         "commit": _commit(),
         "data": OmegaConf.to_container(config.data, resolve=True),
-        "clips": {part: len(found) for part, found in clips.items()},
-        "poses": {part: sum(len(clip.rotations) for clip in found) for part, found in clips.items()},
+        "clips": {part: len({clip.part_of for clip in found}) for part, found in clips.items()},
+        "poses": {part: sum(clip.poses for clip in found) for part, found in clips.items()},
         "settings": {**settings, "lod": str(config.lod)},
     }
 

@@ -15,6 +15,7 @@ import torch
 from omegaconf import DictConfig, OmegaConf
 
 from soma_core.cache import atomic_write, content_key
+from soma_core.correctives.processes import Processes, joined_processes
 from soma_core.errors import InputError
 from soma_core.layer import SomaLayer
 from soma_core.paths import cache_dir
@@ -23,8 +24,9 @@ from soma_core.progress import progress
 from soma_core.rig import load_canonical
 from soma_core.rig.mesh import CanonicalMesh
 from soma_core.rig.neutral import ShapeSpace
+from soma_core.shape_space.converted import ConvertedBodies
 from soma_core.shape_space.report import ErrorRow, plot_errors, reconstruction_errors
-from soma_core.shape_space.sampling import HELD_OUT, IdentityStream
+from soma_core.shape_space.sampling import HELD_OUT, IdentityStream, ShapeStream
 from soma_core.shape_space.training import Components, TrainingPlan, train_components
 
 __all__ = ["SHAPE_SPACE_FILE", "run", "write_shape_space"]
@@ -40,20 +42,24 @@ def run(config: DictConfig, output: Path) -> None:
     """Sample, train, measure on held-out identities, and write the shape space and its report.
 
     Writes ``shape_space.npz`` (or the file `config.out`), ``report.json`` and, where matplotlib is
-    installed, ``reconstruction.png`` into `output`.
+    installed, ``reconstruction.png`` into `output`. Under ``torchrun`` all processes make bodies, and the
+    first one trains and writes; the result is that of one process.
 
     Raises:
-        InputError: a mixture, a plan or an option that cannot be used.
+        InputError: a mixture, shards, a plan or an option that cannot be used.
         BackendError: a backend of the mixture is not usable.
     """
     if config.held_out < 1:
         raise InputError("held_out", got=config.held_out, expected="at least 1", fix="Try held_out=200.")
-    plan = TrainingPlan(
-        count=config.count, components=config.components, batch=config.batch, mirror=config.mirror
-    )
+    with joined_processes("cpu") as processes:
+        _trained(config, output, processes)
+
+
+def _trained(config: DictConfig, output: Path, processes: Processes) -> None:
     mesh, _ = load_canonical("mid")
-    stream = _identity_stream(config)
-    provenance = _provenance(config, mesh)
+    stream, count, source = _stream(config, processes)
+    plan = _plan(config, count)
+    provenance = {**_provenance(config, mesh), **source}
     key = content_key(_CODE_VERSION, json.dumps(provenance, sort_keys=True), str(plan))
     total = len(plan.batch_sizes)
     components = train_components(
@@ -65,7 +71,10 @@ def run(config: DictConfig, output: Path) -> None:
         key=key,
         resume=config.resume,
         progress=lambda steps, done: progress(steps, label="shape space, batch", total=total, done=done),
+        processes=processes,
     )
+    if components is None:
+        return
     held_out = stream.shapes(HELD_OUT, 0, config.held_out)
     errors = reconstruction_errors(components.mean, components.directions, held_out)
     metadata = {**provenance, **_measured(components, errors, config.held_out)}
@@ -89,19 +98,37 @@ def write_shape_space(path: Path, space: ShapeSpace) -> None:
     atomic_write(path, lambda part: np.savez_compressed(part, metadata=np.array(text), **arrays))
 
 
-def _identity_stream(config: DictConfig) -> IdentityStream:
+def _plan(config: DictConfig, count: int) -> TrainingPlan:
+    return TrainingPlan(
+        count=count, components=config.components, batch=config.batch, mirror=config.mirror,
+        save_every=config.save_every,
+    )  # fmt: skip
+
+
+def _stream(config: DictConfig, processes: Processes) -> tuple[ShapeStream, int, dict[str, Any]]:
+    """Where bodies come from, how many to train on, and what a file says of that."""
+
+    def layer(name: str, options: Mapping[str, Any] | None) -> SomaLayer:
+        return SomaLayer(name, options=options, device=config.device, dtype=torch.float32)
+
+    if config.shards:
+        bodies = ConvertedBodies(
+            list(config.shards), held_out=config.held_out, most=config.count, layer=layer, seed=config.seed,
+            batch_sizes=lambda count: _plan(config, count).batch_sizes, processes=processes,
+        )  # fmt: skip
+        shards = {"key": bodies.key, "files": [Path(each).name for each in config.shards]}
+        source = {"trained_on": bodies.origins, "identities": bodies.count, "shards": shards}
+        return bodies, bodies.count, source
     options = OmegaConf.to_container(config.options, resolve=True)
-    layers = {
-        name: SomaLayer(name, options=options.get(name), device=config.device, dtype=torch.float32)
-        for name in config.mix
-    }
-    return IdentityStream(
+    layers = {name: layer(name, options.get(name)) for name in config.mix}
+    drawn = IdentityStream(
         layers,
         dict(config.mix),
         seed=config.seed,
         spread=config.spread,
         skip_groups=list(config.skip_groups),
     )
+    return drawn, config.count, {}
 
 
 def _provenance(config: DictConfig, mesh: CanonicalMesh) -> dict[str, Any]:
@@ -116,7 +143,7 @@ def _provenance(config: DictConfig, mesh: CanonicalMesh) -> dict[str, Any]:
         "rig_revision": mesh.revision,
         "trained_on": [
             {**_origin(name), "share": share, "options": options.get(name, {})}
-            for name, share in config.mix.items()
+            for name, share in ({} if config.shards else config.mix).items()
         ],
         "identities": config.count,
         "mirror_images": config.mirror,

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 
-from soma_core.correctives.data import ClipPlan, LessonStore, plan_clips, split_clips
+from soma_core.correctives.data import ClipPlan, LessonStore, split_clips
 from soma_core.correctives.network import CorrectivesNetwork
 from soma_core.correctives.plot import plot_history
 from soma_core.correctives.processes import Processes
@@ -34,10 +34,8 @@ def lessons(body, tmp_path_factory):
     from tests.correctives.conftest import KnownTeacher
 
     store = LessonStore(tmp_path_factory.mktemp("lessons"), KnownTeacher(body), body.mesh, body.rig)
-    plan = ClipPlan(random_clips=8, hanging_clips=0, poses=16, motions={}, seed=0)
-    clips = plan_clips(plan, body.rig.user_joint_names)
-    for clip in clips:
-        store.teach(clip)
+    plan = ClipPlan(random_clips=8, hanging_clips=0, poses=16, seed=0)
+    clips = [store.teach(plan.clip(number, body.rig.user_joint_names)) for number in range(len(plan))]
     return store, split_clips(clips, held_out=0.125, seed=0)
 
 
@@ -92,7 +90,30 @@ def test_a_killed_run_goes_on_to_the_last_bit(trainer, tmp_path, caplog):
         _run(trainer(), tmp_path / "state.pt", kill_after=2)
     with caplog.at_level(logging.INFO):
         resumed = _run(trainer(), tmp_path / "state.pt", resume=True)
-    assert "going on after epoch 2" in caplog.text
+    assert "going on after epoch 2 and 0 batches" in caplog.text
+    assert resumed.history == whole.history
+    for name, value in whole.network.state_dict().items():
+        assert torch.equal(value, resumed.network.state_dict()[name]), name
+
+
+def test_a_run_killed_within_an_epoch_goes_on_to_the_last_bit(trainer, tmp_path, caplog, monkeypatch):
+    whole = _run(trainer(save_every=2), tmp_path / "whole.pt")
+    save, saved = Trainer._save, []
+
+    def killing(self, path, key):
+        save(self, path, key)
+        saved.append(self._state.batch)
+        if len(saved) == 9:
+            raise KilledError
+
+    monkeypatch.setattr(Trainer, "_save", killing)
+    with pytest.raises(KilledError):
+        _run(trainer(save_every=2), tmp_path / "state.pt")
+    assert saved[-1] > 0  # within an epoch
+    monkeypatch.setattr(Trainer, "_save", save)
+    with caplog.at_level(logging.INFO):
+        resumed = _run(trainer(save_every=2), tmp_path / "state.pt", resume=True)
+    assert f"and {saved[-1]} batches" in caplog.text
     assert resumed.history == whole.history
     for name, value in whole.network.state_dict().items():
         assert torch.equal(value, resumed.network.state_dict()[name]), name
@@ -104,8 +125,6 @@ def test_a_state_of_another_run_is_left_alone(trainer, tmp_path, caplog):
     fresh = _run(trainer(epochs=2), tmp_path / "state.pt", resume=True)
     assert "belongs to another configuration" in caplog.text
     assert len(fresh.history) == 2
-    _run(trainer(epochs=1), tmp_path / "none.pt", resume=True)
-    assert "no saved state of this run" in caplog.text
 
 
 def test_training_stops_when_nothing_improves(trainer, tmp_path):
@@ -139,7 +158,7 @@ SCRIPT = """
 import sys, numpy as np, torch
 from pathlib import Path
 from tests.correctives.conftest import CHANNELS, KnownTeacher, made_body
-from soma_core.correctives.data import ClipPlan, LessonStore, plan_clips, split_clips
+from soma_core.correctives.data import ClipPlan, LessonStore, split_clips
 from soma_core.correctives.network import CorrectivesNetwork
 from soma_core.correctives.processes import joined_processes
 from soma_core.correctives.training import Trainer, TrainingOptions
@@ -147,8 +166,8 @@ from soma_core.correctives.training import Trainer, TrainingOptions
 body = made_body()
 mesh, rig, masks = body.mesh, body.rig, body.masks
 store = LessonStore(Path(sys.argv[1]), KnownTeacher(body), mesh, rig)
-plan = ClipPlan(random_clips=8, hanging_clips=0, poses=16, motions={}, seed=0)
-clips = plan_clips(plan, rig.user_joint_names)
+plan = ClipPlan(random_clips=8, hanging_clips=0, poses=16, seed=0)
+clips = [store.teach(plan.clip(number, rig.user_joint_names)) for number in range(len(plan))]
 split = split_clips(clips, held_out=0.125, seed=0)
 vertices = np.arange(0, mesh.vertex_count, 3)
 network = CorrectivesNetwork(masks.joints, masks.vertices[:, vertices].tocsr(), channels=CHANNELS, seed=1)
