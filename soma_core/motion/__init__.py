@@ -22,6 +22,7 @@ if TYPE_CHECKING:
         smooth,
         without_spikes,
     )
+    from soma_core.motion.clip_stream import ClipStream
     from soma_core.motion.conversion import convert, convert_file, convert_people, load_clip
     from soma_core.motion.converter import Converted, finish_fit, invert, plan_fit
     from soma_core.motion.files import layout_of, read, write
@@ -49,6 +50,7 @@ __all__ = [
     "BackendChoice",
     "CleanOptions",
     "Cleaned",
+    "ClipStream",
     "ConvertOptions",
     "Converted",
     "DatasetOptions",
@@ -108,6 +110,7 @@ _HOMES = {
         "smooth",
         "without_spikes",
     ],
+    "soma_core.motion.clip_stream": ["ClipStream"],
     "soma_core.motion.conversion": ["convert", "convert_file", "convert_people", "load_clip"],
     "soma_core.motion.converter": ["Converted", "finish_fit", "invert", "plan_fit"],
     "soma_core.motion.files": ["layout_of", "read", "write"],

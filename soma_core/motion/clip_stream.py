@@ -49,7 +49,12 @@ class ClipStream(IterableDataset[dict[str, Any]]):
     """
 
     def __init__(
-        self, sources: Sequence[str | Path], columns: Sequence[str], *, seed: int | None, setting: str
+        self,
+        sources: Sequence[str | Path],
+        columns: Sequence[str],
+        *,
+        seed: int | None = None,
+        setting: str = "sources",
     ) -> None:
         self._columns = list(columns)
         files = [file for source in sources for file in shard_files(source)]
