@@ -102,7 +102,7 @@ PUBLIC_NAMES = {
         write_motion write_usd
     """,
     "soma_core.motion": """
-        Animated BackendChoice CleanOptions Cleaned ConvertOptions Converted DatasetOptions FitOptions FitPlan
+        Animated BackendChoice CleanOptions Cleaned ClipStream ConvertOptions Converted DatasetOptions FitOptions FitPlan
         FolderConverted FrameRange IdentityChoice InversionChoice InvertOptions LimbSeconds Picture Played
         ShardsConverted SkeletonMotion WriteOptions animate clean convert convert_dataset convert_file
         convert_folder convert_people convert_shards finish_fit fit_chunks invert layout_of load_clip mirror
