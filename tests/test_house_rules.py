@@ -102,12 +102,12 @@ PUBLIC_NAMES = {
         write_motion write_usd
     """,
     "soma_core.motion": """
-        Animated BackendChoice CleanOptions Cleaned ClipStream ConvertOptions Converted DatasetOptions FitOptions FitPlan
-        FolderConverted FrameRange IdentityChoice InversionChoice InvertOptions LimbSeconds Picture Played
-        ShardsConverted SkeletonMotion WriteOptions animate clean convert convert_dataset convert_file
-        convert_folder convert_people convert_shards finish_fit fit_chunks invert layout_of load_clip mirror
-        mirrored_body motion_quality plan_fit read read_bvh resample retarget smooth stored_identity
-        without_spikes write write_body write_bvh write_products
+        Animated BackendChoice CleanOptions Cleaned ClipStream ConvertOptions Converted DatasetOptions
+        FitOptions FitPlan FolderConverted FrameRange IdentityChoice InversionChoice InvertOptions
+        LimbSeconds Picture Played ShardsConverted SkeletonMotion WriteOptions animate clean convert
+        convert_dataset convert_file convert_folder convert_people convert_shards finish_fit fit_chunks
+        invert layout_of load_clip mirror mirrored_body motion_quality plan_fit read read_bvh resample
+        retarget smooth stored_identity without_spikes write write_body write_bvh write_products
     """,
     "soma_core.plugin": """
         API_VERSION Axis BackendSpec BrokenBackendError Check CheckFailedError CheckNotRunError ClosestFaces
