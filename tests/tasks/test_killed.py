@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import importlib.util
 import json
 import os
+import shutil
 import signal
 import socket
 import subprocess
@@ -17,8 +17,6 @@ import numpy as np
 import pytest
 
 from soma_core.motion.clips import clip_schema, write_rows
-from soma_core.obj import write_obj
-from soma_core.rig import load_canonical
 
 pytestmark = [
     pytest.mark.slow,
@@ -28,12 +26,12 @@ pytestmark = [
 ROOT = Path(__file__).resolve().parents[2]
 SOMA = (sys.executable, "-c", "from soma_core.cli import console; console()")
 SHAPE = (
-    "train-shape", "~mix.anny", "+mix.soma=1.0", "count=48", "components=4", "batch=8", "held_out=4",
+    "train-shape", "~mix.anny", "+mix.soma=1.0", "count=16", "components=4", "batch=4", "held_out=4",
     "save_every=1",
 )  # fmt: skip
 CORRECTIVES = (
-    "train-correctives", "data.random_clips=3", "data.hanging_clips=1", "data.poses=4", "channels=2",
-    "batch=4", "epochs=3", "save_every=1", "mebibytes=1",
+    "train-correctives", "data.random_clips=3", "data.hanging_clips=1", "data.poses=2", "channels=2",
+    "batch=2", "epochs=2", "save_every=1", "mebibytes=1",
 )  # fmt: skip
 LIMIT_S = 900
 
@@ -97,23 +95,30 @@ def homes(tmp_path: Path) -> tuple[Path, Path]:
     return whole, cut
 
 
+def warmed(whole: Path, cut: Path) -> None:
+    """Give the other home what says nothing of a run: the regressors of the rig, read again in any run."""
+    for kind in ("canonical", "joint_regressor"):
+        if (whole / "cache" / kind).exists():
+            shutil.copytree(whole / "cache" / kind, cut / "cache" / kind)
+
+
 def trained(arguments: Sequence[str], home: Path) -> tuple[str, ...]:
     return (*SOMA, *arguments, f"hydra.run.dir={home / 'run'}")
 
 
 @pytest.fixture(scope="module")
 def shards(tmp_path_factory):
-    """Thirty bodies, each in one clip of a few frames, in three files."""
+    """Bodies, each in one clip of a few frames, in three files."""
     pa = pytest.importorskip("pyarrow")
     folder, random = tmp_path_factory.mktemp("shards"), np.random.default_rng(0)
     for file in range(3):
         rows = []
-        for clip in range(10):
+        for clip in range(8):
             params = json.dumps({"shape": random.normal(size=6).tolist()})
             rows.append({
                 "name": f"{file}-{clip}", "state": "converted", "identity_model_type": "soma",
                 "identity_params": params, "start": 0, "convention": "t_pose_relative",
-                "poses": (0.2 * random.normal(size=(3, 77, 3))).tolist(),
+                "poses": (0.2 * random.normal(size=(1, 77, 3))).tolist(),
             })  # fmt: skip
         write_rows(folder / f"{file:06d}.parquet", [pa.Table.from_pylist(rows, schema=clip_schema())])
     return str(folder)
@@ -125,6 +130,7 @@ def test_train_shape(tmp_path, shards, count):
     arguments = SHAPE if count == 1 else (*SHAPE[3:], f"shards=[{shards}]")
     arguments = arguments if count == 1 else ("train-shape", *arguments)
     finished(trained(arguments, whole), whole)  # by one process, whatever the other takes
+    warmed(whole, cut)
     command, states = trained(arguments, cut), cut / "cache/train_shape"
     killed(command, cut, lambda: list(states.glob("[!.]*.npz")), count)
     assert "going on after batch" in finished(command, cut, count)
@@ -136,36 +142,9 @@ def test_train_correctives(tmp_path, shards, count):
     whole, cut = homes(tmp_path)
     arguments = CORRECTIVES if count == 1 else (*CORRECTIVES, f"data.motions=[{shards}]", "data.step=1")
     finished(trained(arguments, whole), whole, count)
+    warmed(whole, cut)
     command, cache = trained(arguments, cut), cut / "cache/train_correctives"
     killed(command, cut, lambda: list(cache.glob("lessons/*/[!.]*.npz")), count)  # while it is taught
     killed(command, cut, lambda: list(cache.glob("[!.]*.pt")), count)
     assert "going on after epoch" in finished(command, cut, count)
     equal_files(whole / "run", cut / "run", ["correctives_model.pt", "report.json"])
-
-
-def test_wrap(tmp_path):
-    whole, cut = homes(tmp_path)
-    mesh = load_canonical("low")[0]
-    write_obj(tmp_path / "body.obj", 1.1 * mesh.vertices, mesh.triangles)
-    command = (*SOMA, "wrap", f"native={tmp_path / 'body.obj'}", "unit=m", "picture=false", "out=made")
-    finished(command, whole)
-    killed(command, cut, lambda: list((cut / "made").glob("body.obj")))
-    finished(command, cut)
-    equal_files(whole / "made", cut / "made", ["SOMA_wrap.obj", "body.obj", "report.json"])
-
-
-@pytest.mark.skipif(importlib.util.find_spec("anny") is None, reason="anny is not installed")
-def test_assets(tmp_path):
-    whole, cut = homes(tmp_path)
-    command = (sys.executable, "-m", "assets.make", "--output", "assets")
-    finished(command, whole)
-    for file in ("SOMA_template_rig.usda", "SOMA_neutral.npz"):
-        killed(command, cut, (cut / "assets" / file).exists)
-    finished(command, cut)
-    names = [
-        path.relative_to(whole / "assets").as_posix()
-        for path in (whole / "assets").rglob("*")
-        if path.is_file()
-    ]
-    assert len(names) >= 5
-    equal_files(whole / "assets", cut / "assets", names)
