@@ -32,6 +32,7 @@ from soma_core.errors import InputError
 from soma_core.geometry.torch_func import untracked
 from soma_core.paths import expanded
 from soma_core.plugin.registry import Registry, default_registry
+from soma_core.plugin.spec import HasSkinning
 from soma_core.points.part import PartialBodies, as_matrices
 from soma_core.rig import load_canonical
 from soma_core.rig.manifest import NEUTRAL_NAME
@@ -106,13 +107,14 @@ class SomaLayer(PartialBodies):
         self.procedural = procedural and self.rig.procedural is not None
         shipped = self.procedural and repose and canonical is None
         self.correctives_file = find_correctives(correctives, shipped=shipped, root=self.mesh.root)
-        self._registry = registry or default_registry()
-        self.spec = self._registry.spec(backend)
+        self.registry = registry or default_registry()
+        self.spec = self.registry.spec(backend)
         self._build(self.device, dtype)
 
     def _build(self, device: torch.device, dtype: torch.dtype) -> None:
         self.device, self.dtype = device, dtype
-        generator = self._registry.generator(self.backend, device=device, dtype=dtype, options=self.options)
+        generator = self.registry.generator(self.backend, device=device, dtype=dtype, options=self.options)
+        self.tells_skinning = isinstance(generator, HasSkinning)
         wrap_mesh = self.mesh if self.mesh.lod == "mid" else load_canonical("mid", self.mesh.root)[0]
         mesh, rig, reduction = self.mesh, self.rig, None
         if self.mesh.lod == "xlo":
@@ -121,7 +123,7 @@ class SomaLayer(PartialBodies):
         self.rest_shape = make_rest_shape(
             self.spec, generator, mesh, rig, device=device, dtype=dtype, exact=self.exact,
             warp=self.kernels != "torch", wrap_mesh=wrap_mesh, reduction=reduction,
-            isolated=functools.partial(self._registry.isolated, self.backend),
+            isolated=functools.partial(self.registry.isolated, self.backend),
         )  # fmt: skip
         self.animation = Animation(self.rig, device=device, dtype=dtype, kernels=self.kernels)
         self.posing = self.animation

@@ -18,8 +18,9 @@ from soma_core.evaluation.random_poses import joint_spread, smooth_axis_angles
 from soma_core.evaluation.report import Figure, Report, ShownBody, Table
 from soma_core.geometry.rotations import axis_angle_to_matrix
 from soma_core.inversion import PoseInversion
-from soma_core.inversion.identity import IdentityFit, fit_identity
+from soma_core.inversion.result import IdentityFit
 from soma_core.layer import SomaLayer
+from soma_core.native.identity import fit_identity
 from soma_core.plugin.registry import default_registry
 from soma_core.progress import progress
 from soma_core.rig.mesh import Lod

@@ -18,11 +18,11 @@ from soma_core.evaluation.report import Figure, Report, ShownBody, Table
 from soma_core.evaluation.shipped_layers import LAYERS, layer_label
 from soma_core.files import refuse_unreadable
 from soma_core.inversion import PoseInversion
-from soma_core.inversion.identity import IdentityFit, fit_identity
 from soma_core.inversion.report import InversionReport
-from soma_core.inversion.result import InversionResult
+from soma_core.inversion.result import IdentityFit, InversionResult
 from soma_core.io.sam3d import read_sam3d
 from soma_core.layer import SomaLayer
+from soma_core.native.identity import fit_identity
 from soma_core.paths import expanded
 from soma_core.plugin.spec import BackendSpec
 from soma_core.progress import progress

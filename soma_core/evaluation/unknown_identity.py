@@ -21,8 +21,9 @@ from soma_core.evaluation.shipped_layers import LAYERS, layer_label
 from soma_core.geometry.kabsch import rotation_from_covariance
 from soma_core.geometry.rotations import axis_angle_to_matrix
 from soma_core.inversion import PoseInversion
-from soma_core.inversion.identity import IdentityFit, IdentityMethod, fit_identity
+from soma_core.inversion.result import IdentityFit
 from soma_core.layer import SomaLayer
+from soma_core.native.identity import IdentityMethod, fit_identity
 from soma_core.progress import progress
 from soma_core.rig.mesh import Lod
 from soma_core.shape_space.sampling import sample_parameters

@@ -3,9 +3,8 @@
 from soma_core.inversion.analytical import AnalyticalOptions
 from soma_core.inversion.autograd import AutogradOptions
 from soma_core.inversion.fit import PoseInversion
-from soma_core.inversion.identity import IdentityFit, fit_identity
 from soma_core.inversion.priors import HINGES, PosePriors
-from soma_core.inversion.result import InversionResult
+from soma_core.inversion.result import IdentityFit, InversionResult
 
 __all__ = [
     "HINGES",
@@ -15,5 +14,4 @@ __all__ = [
     "InversionResult",
     "PoseInversion",
     "PosePriors",
-    "fit_identity",
 ]

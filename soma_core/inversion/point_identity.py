@@ -12,12 +12,12 @@ from torch import Tensor
 
 from soma_core.errors import InputError
 from soma_core.inversion.free_parameters import FreeParameters
-from soma_core.inversion.identity import IdentityFit
 from soma_core.inversion.levenberg import Damping, bounded_step, descend, promising
 from soma_core.inversion.point_model import PointModel
 from soma_core.inversion.point_rows import PointRows, rows_of
 from soma_core.inversion.points import PointInversion
 from soma_core.inversion.problem import Pose, part_of
+from soma_core.inversion.result import IdentityFit
 from soma_core.skeleton.identity import Identity
 
 __all__ = ["fit_point_identity"]

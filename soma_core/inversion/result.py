@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 
 import torch
@@ -12,7 +12,7 @@ from soma_core.inversion.problem import Pose
 from soma_core.layer import SomaLayer
 from soma_core.skeleton.identity import Identity
 
-__all__ = ["InversionResult", "joined"]
+__all__ = ["IdentityFit", "InversionResult", "joined"]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -109,3 +109,25 @@ def joined(parts: Sequence[InversionResult]) -> InversionResult:
         return parts[0]
     names = [one.name for one in fields(InversionResult)]
     return InversionResult(**{name: torch.cat([getattr(part, name) for part in parts]) for name in names})
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class IdentityFit:
+    """One identity for a sequence, and its poses.
+
+    Attributes:
+        identity: the rest shape and its skeleton, batch of 1.
+        params: the backend's parameters of that shape; when unposed, of the shape it began from.
+        pose: of every frame under the identity.
+        frames: (n,) numbers of the frames that the identity was estimated from.
+        history: root mean square vertex error [m] over those frames at the start and after each step, while
+            joint centres may move. It rises where vertices that are not explained begin to count less.
+        converged: whether the last step no longer changed the error noticeably.
+    """
+
+    identity: Identity
+    params: Mapping[str, Tensor]
+    pose: InversionResult
+    frames: Tensor
+    history: tuple[float, ...]
+    converged: bool

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from operator import itemgetter
 from typing import Protocol
 
 import numpy as np
@@ -17,7 +18,7 @@ from soma_core.inversion.result import InversionResult
 from soma_core.inversion.shape_response import shape_normal_equations
 from soma_core.skeleton.identity import Identity
 
-__all__ = ["Sample", "ShapeFound", "search_parameters"]
+__all__ = ["Rival", "Sample", "ShapeFound", "evenly", "search_parameters"]
 
 _PLAIN, _ROBUST = 1.0, 5e-4
 """Scale of the loss [m]: vertices whose error lies above it count less. The first leaves all alike."""
@@ -25,6 +26,9 @@ _PLAIN, _ROBUST = 1.0, 5e-4
 _CANDIDATES, _STARTS = 48, 4
 _FEW_FRAMES, _FEW_STEPS = 4, 6
 """Bodies looked at, and those of them followed a few steps on a few frames; the best one goes on."""
+
+_CLEARLY = 0.8
+"""Share of the error that a rival must stay below."""
 
 _AT_A_TIME = 8
 """Candidates fitted at a time, to bound memory."""
@@ -53,6 +57,16 @@ class Unknowns(Bounded, Protocol):
         ...
 
 
+def evenly(total: int, count: int) -> Tensor:
+    """Up to `count` of `total` numbers, evenly spread."""
+    return torch.linspace(0, total - 1, min(count, total)).round().long()
+
+
+Rival = Callable[[int, np.ndarray, int], tuple[np.ndarray, float]]
+"""Another model with these parameters: frames to look at, where to begin, and the largest number of steps; to
+where the search ends and the error [m] that is left there, as a root mean square."""
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Sample:
     """The frames that an identity is estimated from.
@@ -71,7 +85,7 @@ class Sample:
 
     def some(self, count: int) -> Sample:
         """Up to `count` frames, evenly spread."""
-        index = torch.linspace(0, len(self.vertices) - 1, min(count, len(self.vertices))).round().long()
+        index = evenly(len(self.vertices), count)
         weights = self.weights[index] if len(self.weights) > 1 else self.weights
         return Sample(vertices=self.vertices[index], weights=weights)
 
@@ -118,20 +132,34 @@ class _State:
 
 
 def search_parameters(
-    inversion: PoseInversion, sample: Sample, parameters: FreeParameters, *, iterations: int
+    inversion: PoseInversion,
+    sample: Sample,
+    parameters: FreeParameters,
+    *,
+    iterations: int,
+    rival: Rival | None = None,
 ) -> ShapeFound:
     """Minimise the error over the parameters, every frame in its best pose.
 
     Two models that share a rest shape turn it about other joint centres and bend their skin differently;
     neither is a fault of the shape. Joint centres are therefore unknowns too, to be dropped in the end, and a
     second descent lets vertices count by how well they are explained. A single frame does not tell joints and
-    bending from shape: there the parameters are all that is sought.
+    bending from shape: there the parameters are all that is sought. None of this is needed where a `rival`
+    explains a few frames better: it goes on alone.
     """
     few = _Search(inversion, sample.some(_FEW_FRAMES), parameters)
     spread = parameters.spread(_CANDIDATES)
     starts = promising(parameters, spread, few.errors, _STARTS - 1, at_once=_AT_A_TIME)
     found = [few.descend(point, _PLAIN, min(iterations, _FEW_STEPS))[0] for point in starts]
     best = min(found, key=lambda state: float(few.sample.mean(state.squares)))
+    if rival is not None:
+        error = float(few.sample.mean(best.squares).sqrt())
+        point, left = min((rival(_FEW_FRAMES, state.point, iterations) for state in found), key=itemgetter(1))
+        if left < _CLEARLY * error:
+            point, after = rival(len(sample.vertices), point, iterations)
+            return ShapeFound(
+                identity=parameters.identities(point[None]), history=(error, left, after), converged=True
+            )
     count, moving = len(best.point), len(sample.vertices) > 1
     unknowns = WithJoints(parameters, inversion.layer) if moving else parameters
     whole = _Search(inversion, sample, unknowns)

@@ -13,11 +13,12 @@ import torch
 
 from soma_core.cache import atomic_write
 from soma_core.errors import InputError
-from soma_core.inversion import IdentityFit, fit_identity
+from soma_core.inversion.result import IdentityFit
 from soma_core.io.motion import Motion
 from soma_core.layer import SomaLayer
 from soma_core.motion.models import under
 from soma_core.motion.posed_input import PosedInput
+from soma_core.native.identity import fit_identity
 from soma_core.options import IdentityChoice
 from soma_core.rig import load_canonical
 from soma_core.skeleton.identity import Identity

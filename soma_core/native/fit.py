@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, get_args
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -14,12 +16,13 @@ from soma_core.backends.parameters import batch_parameters
 from soma_core.errors import InputError
 from soma_core.geometry.rotations import matrix_to_axis_angle
 from soma_core.inversion._inputs import check_weights, refuse_transforms
+from soma_core.inversion.fit import Topology
 from soma_core.inversion.implicit import attach_gradient
 from soma_core.layer import Kernels
 from soma_core.native.model import NativeBody, NativeRig
 from soma_core.native.motion import NativeMotion
 from soma_core.native.poses import PoseFit
-from soma_core.native.shape import fit_shape
+from soma_core.native.shape import Unknowns, fit_shape
 from soma_core.native.transfer import NativeTransfer
 from soma_core.plugin.declaration import skinned_problem
 from soma_core.plugin.errors import PluginError
@@ -30,6 +33,10 @@ from soma_core.skeleton.identity import Identity
 from soma_core.topology.frames import METRES
 
 __all__ = ["NativeFit"]
+
+_STEPS = (0.1, -0.3, 0.3, 0.1)
+"""Steps that derivatives by parameters are taken over, in their units, one search after the other: inward, or
+outward. Phenotypes have kinks, at which one side does not see what the other does."""
 
 _CHUNK = 64
 """Frames fitted at a time: their posed meshes and the derivatives of those stay near the cache."""
@@ -179,37 +186,72 @@ class NativeFit(Derived):
             if value < 1:
                 raise InputError(name, got=value, expected="at least 1", fix=f"Leave {name} out.")
         spread = torch.linspace(0, len(vertices) - 1, min(frames, len(vertices))).round().long()
-        target, counted = self._native(vertices[spread]), self._weights(weights)
-        begin = self._one_body(start)
-        first = self._prepared(begin, counted)
-        target, _, known = _finite(first.body, target, counted)
+        unknowns = _Every(self._one_body(start))
+        found, _ = self.search(
+            vertices[spread], unknowns, unknowns.start, weights=weights, iterations=iterations
+        )
+        return unknowns.params(found[None])
+
+    @own_precision
+    @torch.no_grad()
+    def search(
+        self,
+        vertices: Tensor,
+        unknowns: Unknowns,
+        begin: np.ndarray,
+        *,
+        topology: Topology = "canonical",
+        weights: Tensor | None = None,
+        iterations: int = 10,
+    ) -> tuple[np.ndarray, float]:
+        """Values (k,) of the unknowns whose best poses come nearest to all frames, and the error left [m].
+
+        Args:
+            vertices: (F, v, 3) [m] on the canonical mesh, or (F, n, 3) in the native unit and axes.
+            unknowns: what may change, such as :class:`FreeParameters`.
+            begin: where to begin, (k,).
+            topology: of the vertices.
+            weights, iterations: as for :meth:`fit_params`.
+
+        Raises:
+            InputError: a wrong shape, a negative weight, or no usable frame.
+        """
+        counted = self._weights(weights)
+
+        def prepare(point: np.ndarray) -> PoseFit:
+            return self._prepared(unknowns.params(point[None]), counted)
+
+        def directions(point: np.ndarray, step: float) -> Identity:
+            steps = unknowns.inward(point, step)
+            outside = (point + steps < unknowns.lower) | (point + steps > unknowns.upper)
+            steps = np.where(outside, -steps, steps)
+            some = unknowns.params(point + np.concatenate((np.zeros((1, len(steps))), np.diag(steps))))
+            model = self._model(some)
+            length = torch.as_tensor(steps).to(model.rest)[:, None, None]
+            rest, joints = ((one[1:] - one[:1]) / length for one in (model.rest, model.joints))
+            return self.rig.bodies(rest, joints)
+
+        target = (
+            self._native(vertices)
+            if topology == "canonical"
+            else self.scale * vertices.to(self.device, self.dtype)
+        )
+        target, _, known = _finite(prepare(begin).body, target, counted)
         if not bool(known.any()):
             raise InputError(
                 "vertices",
-                got=f"{len(spread)} frames of which none is finite",
+                got=f"{len(vertices)} frames of which none is finite",
                 expected="frames of a body",
                 fix="Leave out frames without a body.",
             )
-        sizes = {name: value.shape for name, value in begin.items()}
-
-        def named(points: Tensor) -> dict[str, Tensor]:
-            parts = points.split([shape[1:].numel() for shape in sizes.values()], 1)
-            return {name: part.reshape(-1, *sizes[name][1:]) for name, part in zip(sizes, parts, strict=True)}
-
-        def directions(point: Tensor) -> Identity:
-            units = torch.cat((point[None], point + torch.eye(len(point)).to(point)))
-            model = self._model(named(units))
-            rest, joints = (one[1:] - one[:1] for one in (model.rest, model.joints))
-            return self.rig.bodies(rest, joints)
-
-        point = fit_shape(
-            lambda point: self._prepared(named(point[None]), counted),
-            directions,
-            torch.cat([value.flatten() for value in begin.values()]),
-            target[known.any(1)],
-            iterations=iterations,
-        )
-        return named(point[None])
+        target = target[known.any(1)]
+        point, error = begin, np.inf
+        for step in _STEPS if np.isfinite(unknowns.upper).any() else _STEPS[:1]:
+            point, error = fit_shape(
+                prepare, functools.partial(directions, step=step), unknowns, target, start=point,
+                iterations=iterations,
+            )  # fmt: skip
+        return point, error
 
     def _native(self, vertices: Tensor) -> Tensor:
         """Native vertices (F, n, 3) in metres."""
@@ -291,6 +333,26 @@ def _finite(body: NativeBody, target: Tensor, weights: Tensor) -> tuple[Tensor, 
     filled = torch.where(known[..., None], target, body.identity.rest)
     origin = filled[:, used][:, 0]
     return filled - origin[:, None], origin, known
+
+
+class _Every:
+    """All parameters of one body, without bounds."""
+
+    def __init__(self, begin: Mapping[str, Tensor]) -> None:
+        self._begin = begin
+        self.start = torch.cat([value.flatten() for value in begin.values()]).double().cpu().numpy()
+        self.lower, self.upper = (np.full(len(self.start), bound) for bound in (-np.inf, np.inf))
+
+    def params(self, points: np.ndarray) -> dict[str, Tensor]:
+        """Parameters of (m, k) points, each (m, *shape)."""
+        first = next(iter(self._begin.values()))
+        parts = torch.as_tensor(points).to(first).split([value.numel() for value in self._begin.values()], 1)
+        given = zip(self._begin.items(), parts, strict=True)
+        return {name: part.reshape(-1, *value.shape[1:]) for (name, value), part in given}
+
+    def inward(self, point: np.ndarray, length: float) -> np.ndarray:
+        """Steps (k,) of `length`."""
+        return np.full(len(point), length)
 
 
 def _joined(parts: Sequence[NativeMotion]) -> NativeMotion:

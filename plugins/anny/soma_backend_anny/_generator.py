@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Mapping, Sequence
 
 import numpy as np
@@ -12,7 +13,7 @@ from soma_backend_anny import _basis
 from soma_backend_anny._options import AnnyOptions
 from soma_backend_anny._phenotypes import macro_weights
 from soma_core import InputError
-from soma_core.plugin import BackendSpec, LinearBasis
+from soma_core.plugin import BackendSpec, LinearBasis, SkinnedModel
 
 __all__ = ["AnnyGenerator", "signed_parts"]
 
@@ -40,15 +41,18 @@ class AnnyGenerator:
         self._local_changes = _enabled_local_changes(options.local_changes, declared)
         stored = _basis.load_phenotype_basis(self._phenotypes)
         rank = int((stored.remaining_mm > float(options.tolerance_mm)).sum())
-        rows = [stored.basis[:rank]]
+        rows, places = [stored.basis[:rank]], [stored.joints_basis[:rank]]
         if self._local_changes:
-            rows.append(_basis.load_local_changes(self._local_changes))
+            surface, moved = _basis.load_local_changes(self._local_changes)
+            rows.append(surface)
+            places.append(moved)
 
         def tensor(array: np.ndarray) -> Tensor:
             return torch.from_numpy(array).to(device=device, dtype=dtype)
 
         self._template = tensor(stored.template)
         self._basis = tensor(np.concatenate(rows) if len(rows) > 1 else rows[0])
+        self._joints, self._joints_basis = tensor(stored.joints), tensor(np.concatenate(places))
         self._projection = tensor(stored.projection[:, :rank])
         self._offset = tensor(stored.offset[:rank])
 
@@ -60,8 +64,24 @@ class AnnyGenerator:
         Raises:
             InputError: a parameter that the options did not enable.
         """
-        motion = self._coefficients(params) @ self._basis.flatten(1)
-        return self._template + motion.unflatten(-1, self._template.shape)
+        return _moved(self._template, self._basis, self._coefficients(params))
+
+    def skinning(self, params: Mapping[str, Tensor]) -> SkinnedModel:
+        """Bodies on Anny's own 104 bones, in the package's order; params as of :meth:`rest`."""
+        coefficients = self._coefficients(params)
+        names, parents, weights = self._bones
+        return SkinnedModel(
+            joint_names=names,
+            parents=parents,
+            rest=_moved(self._template, self._basis, coefficients),
+            joints=_moved(self._joints, self._joints_basis, coefficients),
+            weights=weights,
+        )
+
+    @functools.cached_property
+    def _bones(self) -> tuple[tuple[str, ...], tuple[int, ...], Tensor]:
+        names, parents, weights = _basis.load_bones()
+        return names, parents, torch.from_numpy(weights).to(self._template)
 
     def linear_basis(self) -> LinearBasis:
         """The template with every phenotype at 0.5, the basis, and the map from parameters to it."""
@@ -95,6 +115,10 @@ class AnnyGenerator:
                 expected="a parameter that the backend's options enable",
                 fix=f"Add {override} to the command, or pass options={{{option!r}: {value!r}}} in Python.",
             )
+
+
+def _moved(template: Tensor, basis: Tensor, coefficients: Tensor) -> Tensor:
+    return template + (coefficients @ basis.flatten(1)).unflatten(-1, template.shape)
 
 
 def signed_parts(values: Tensor) -> Tensor:

@@ -8,9 +8,10 @@ import torch
 
 from soma_core.errors import InputError
 from soma_core.geometry.rotations import axis_angle_to_matrix
-from soma_core.inversion import PoseInversion, fit_identity
+from soma_core.inversion import PoseInversion
 from soma_core.inversion.free_parameters import FreeParameters, WithJoints
 from soma_core.layer import SomaLayer
+from soma_core.native.identity import fit_identity
 from soma_core.plugin.registry import Registry
 from soma_core.plugin.spec import Parameter
 from tests.bodies import TinyPlugin, randn, tiny_canonical, tiny_spec, write_pair

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any, Literal, get_args
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -13,40 +13,20 @@ from soma_core.errors import InputError
 from soma_core.inversion._inputs import check_weights
 from soma_core.inversion.fit import PoseInversion, Topology
 from soma_core.inversion.free_parameters import FreeParameters
-from soma_core.inversion.result import InversionResult
-from soma_core.inversion.shape_search import Sample, ShapeFound, search_parameters
+from soma_core.inversion.result import IdentityFit
+from soma_core.inversion.shape_search import Rival, Sample, ShapeFound, evenly, search_parameters
 from soma_core.inversion.unposing import Unposing
 from soma_core.layer import SomaLayer
+from soma_core.native.fit import NativeFit
+from soma_core.rig import load_canonical
 from soma_core.skeleton.identity import Identity
 
-__all__ = ["IdentityFit", "IdentityMethod", "fit_identity"]
+__all__ = ["IdentityMethod", "fit_identity"]
 
 IdentityMethod = Literal["backend", "unpose"]
 
 _RESTING = 0.01
 """Unposing ends before a round that lowers the error by less, relatively."""
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class IdentityFit:
-    """One identity for a sequence, and its poses.
-
-    Attributes:
-        identity: the rest shape and its skeleton, batch of 1.
-        params: the backend's parameters of that shape; when unposed, of the shape it began from.
-        pose: of every frame under the identity.
-        frames: (n,) numbers of the frames that the identity was estimated from.
-        history: root mean square vertex error [m] over those frames at the start and after each step, while
-            joint centres may move. It rises where vertices that are not explained begin to count less.
-        converged: whether the last step no longer changed the error noticeably.
-    """
-
-    identity: Identity
-    params: Mapping[str, Tensor]
-    pose: InversionResult
-    frames: Tensor
-    history: tuple[float, ...]
-    converged: bool
 
 
 @torch.no_grad()
@@ -66,8 +46,10 @@ def fit_identity(
     """Recover rest shape and poses together, one identity for all frames.
 
     ``backend`` moves the backend's parameters: Gauss-Newton steps on the error that is left once every frame
-    has taken its best pose, from several starts where parameters are bounded. Another model turns its body
-    about other joints: joint centres may move meanwhile, and what no body explains comes to count less.
+    has taken its best pose, from several starts where parameters are bounded. Frames without gaps that the
+    backend's own skin explains better, where it tells that, decide the parameters under it. Else joint
+    centres may move meanwhile, since another model turns its body about others, and what no body explains
+    comes to count less.
     ``unpose`` goes on from there and lets every vertex of the rest shape move, for people that the backend
     cannot describe; it takes the other model's way of bending skin for shape, though.
 
@@ -97,18 +79,17 @@ def fit_identity(
     if method == "backend" or free is None or free:
         parameters = FreeParameters(layer, start, free)
         search = inversion.skinned("full")  # one model all the way, so that errors compare
-        found = search_parameters(search, sample, parameters, iterations=iterations)
+        whole = bool((weights == inversion.default_weights).all())
+        own = _own_skin(layer, vertices.detach()[chosen], topology, parameters) if whole else None
+        found = search_parameters(search, sample, parameters, iterations=iterations, rival=own)
     params = found.identity.params
     if method == "unpose":
         found = _unpose(inversion, sample, found, iterations)
+    pose = inversion(canonical, found.identity, weights=weights)
     return IdentityFit(
-        identity=found.identity,
-        params=params,
-        pose=inversion(canonical, found.identity, weights=weights),
-        frames=chosen,
-        history=found.history,
+        identity=found.identity, params=params, pose=pose, frames=chosen, history=found.history,
         converged=found.converged,
-    )
+    )  # fmt: skip
 
 
 def _check(method: str, frames: int, iterations: int) -> None:
@@ -125,7 +106,7 @@ def _usable_frames(
 ) -> Tensor:
     """Numbers of up to `count` frames, evenly spread, that a pose can be fitted to."""
     total = len(vertices)
-    spread = torch.linspace(0, total - 1, min(count, total), device=vertices.device).round().long()
+    spread = evenly(total, count).to(vertices.device)
     weight = weights[spread] if len(weights) > 1 else weights
     valid = inversion(vertices[spread], identity, weights=weight).valid
     if not bool(valid.any()):
@@ -136,6 +117,26 @@ def _usable_frames(
             fix="Give weight zero to missing vertices, and leave out frames without a body.",
         )
     return spread[valid]
+
+
+def _own_skin(
+    layer: SomaLayer, vertices: Tensor, topology: Topology, parameters: FreeParameters
+) -> Rival | None:
+    """The search under the backend's own skin; None where it does not tell that, or of another mesh."""
+    lod = layer.mesh.lod
+    known = lod != "xlo" and layer.mesh.root == load_canonical(lod)[0].root
+    if not (layer.tells_skinning and known and bool(vertices.isfinite().all())):
+        return None
+    fit = NativeFit(
+        layer.backend, options=layer.options, lod=lod, device=layer.device, dtype=layer.dtype,
+        kernels=layer.kernels, registry=layer.registry,
+    )  # fmt: skip
+
+    def search(count: int, begin: np.ndarray, iterations: int) -> tuple[np.ndarray, float]:
+        some = vertices[evenly(len(vertices), count)]
+        return fit.search(some, parameters, begin, topology=topology, iterations=iterations)
+
+    return search
 
 
 def _unpose(inversion: PoseInversion, sample: Sample, found: ShapeFound, rounds: int) -> ShapeFound:
