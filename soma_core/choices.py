@@ -177,6 +177,8 @@ class LengthUnit(StrEnum):
     m = "m"
     cm = "cm"
     mm = "mm"
+    inch = "inch"
+    ft = "ft"
 
 
 class Lod(StrEnum):
@@ -225,7 +227,7 @@ class Product(StrEnum):
 
 
 class RotationLayout(StrEnum):
-    """Order of quaternions; whether 6D rotations are the first two rows or columns of a matrix."""
+    """Order of quaternions; whether 6D rotations and matrices are stored row by row or column by column."""
 
     wxyz = "wxyz"
     xyzw = "xyzw"

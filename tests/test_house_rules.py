@@ -6,6 +6,7 @@ import ast
 import functools
 import importlib
 import inspect
+import pkgutil
 import re
 import subprocess
 import sys
@@ -420,3 +421,13 @@ def test_the_hooks_keep_their_signatures() -> None:
         if name.startswith("soma_") and inspect.isfunction(value)
     }
     assert found == HOOKS
+
+
+@pytest.mark.parametrize(
+    "package", ["soma_core", "soma_core.motion", "soma_core.plugin", "soma_core.testing"]
+)
+def test_a_public_name_is_no_module(package):
+    """Importing the module would put it in the place of what the package loads by that name."""
+    module = importlib.import_module(package)
+    modules = {each.name for each in pkgutil.iter_modules(module.__path__)}
+    assert not modules & {*module.__all__}

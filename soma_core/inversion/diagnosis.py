@@ -1,4 +1,4 @@
-"""Why a fit is no fit: mirrored, in another order, of another person, of several, or standing on its head."""
+"""Why a fit is no fit: mirrored, in another order, of another person or several, on its head, all noise."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from soma_core.skeleton.identity import Identity
 
 __all__ = ["Cause", "Diagnosis", "Leaning", "diagnose_fit", "leaning"]
 
-Cause = Literal["missing", "order", "mirrored", "change", "person", "unexplained", "axis"]
+Cause = Literal["missing", "order", "mirrored", "change", "person", "unexplained", "axis", "noise"]
 
 _APART = 0.005
 """Share of vertices away from their neighbours: 0 on every sound body, at 20 mm of noise as well."""
@@ -58,6 +58,10 @@ _WINDOW, _LEAST = 5, 3
 _ALONG = 0.7
 """Cosine between the trunk's mean upward direction and an axis that it is said to follow."""
 
+_NOISY = 0.025
+"""Noise of a coordinate [m] that leaves joints of the body 8 degrees off and more; recorded and estimated
+bodies have less than 6 mm."""
+
 _MM = 1e3
 
 
@@ -68,7 +72,8 @@ class Diagnosis:
     Attributes:
         cause: ``missing``: no frame shows a body; ``order``: vertices in another order; ``mirrored``;
             ``change``: another person from some frame on; ``person``: another person than the identity;
-            ``unexplained``: none of these; ``axis``: the body lies or stands on its head.
+            ``unexplained``: none of these; ``axis``: the body lies or stands on its head; ``noise``: more of
+            it than tells a pose.
         sentence: cause, and the setting that mends it.
         failed: whether the fit is no fit; otherwise the sentence is a warning.
         frame: where the person changes, the first frame after it that was looked at.
@@ -138,7 +143,7 @@ def diagnose_fit(
         found = _changed(strain, mean, numbers[whole]) or _unfitting(strain, mean, searched)
     if found is not None and found.failed:
         return found
-    return found or _leaning(strain, np.eye(3) if axes is None else np.asarray(axes), ups)
+    return found or _leaning(strain, np.eye(3) if axes is None else np.asarray(axes), ups) or _noisy(strain)
 
 
 def _check(layer: SomaLayer, identity: Identity, vertices: Tensor, errors: object, frames: object) -> None:
@@ -312,4 +317,16 @@ def _leaning(strain: CloudStrain, axes: np.ndarray, ups: Collection[str]) -> Dia
     mend = f"pass up={name}" if name in ups else f"turn the vertices until {name} points up"
     return Diagnosis(
         cause="axis", failed=False, sentence=f"{found.sentence}; if that is not its pose, {mend}"
+    )
+
+
+def _noisy(strain: CloudStrain) -> Diagnosis | None:
+    """Noise that leaves little of a pose."""
+    if strain.noise < _NOISY:
+        return None
+    return Diagnosis(
+        cause="noise",
+        failed=False,
+        sentence=f"the vertices are noisy by {_MM * strain.noise:.2g} mm in every coordinate, which leaves "
+        "joints many degrees off; inversion.priors.temporal_strength=1 lets frames steady each other",
     )

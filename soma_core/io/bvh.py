@@ -36,7 +36,7 @@ def write_bvh(
     joints: Literal[77, 78] = 77,
     order: EulerOrder = "ZXY",
     rest: Literal["t_pose", "bind"] = "t_pose",
-    unit: Literal["m", "cm", "mm"] = "cm",
+    unit: Literal["m", "cm", "mm", "inch", "ft"] = "cm",
 ) -> None:
     """Write a motion as BVH, atomically; angles in degrees, continuous over the frames.
 

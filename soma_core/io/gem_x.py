@@ -58,8 +58,9 @@ def holds_gem_x(parts: Mapping[str, np.ndarray]) -> bool:
 
 
 def gem_x_motion(
-    parts: Mapping[str, np.ndarray], *, path: Path, fps: float | None, person: str | None = None
-) -> Motion:
+    parts: Mapping[str, np.ndarray], *, path: Path, fps: float | None, person: str | None = None,
+    columns: bool = False,
+) -> Motion:  # fmt: skip
     """Make a motion of the parameters of one body (metres, +Y up; rotations relative to the T-pose).
 
     Args:
@@ -68,6 +69,7 @@ def gem_x_motion(
         path: where they are from, for messages.
         fps: frame rate of the video, which results do not tell.
         person: whose, from ``0``; needed where there are several.
+        columns: whether matrices are stored column by column.
 
     Raises:
         InputError: no frame rate, or parameters that are no motion.
@@ -104,8 +106,9 @@ def gem_x_motion(
         _matrices(rows(key, frames), count, f"{path}: {key}")
         for key, count in (("global_orient", 1), ("body_pose", _BODY))
     ]
+    rotations = np.concatenate(turns, axis=1)
     return Motion(
-        rotations=np.concatenate(turns, axis=1),
+        rotations=np.swapaxes(rotations, -1, -2) if columns else rotations,
         translation=rows("transl", frames),
         fps=float(fps),
         joint_names=USER_JOINTS,

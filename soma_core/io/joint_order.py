@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
-__all__ = ["CONTACT_JOINTS", "KIMODO_30_JOINTS", "PARENT_NAMES", "USER_JOINTS", "nearest_ancestors"]
+__all__ = [
+    "CONTACT_JOINTS", "KIMODO_30_JOINTS", "PARENT_NAMES", "USER_JOINTS", "nearest_ancestors", "other_side",
+    "other_sides",
+]  # fmt: skip
 
 _FINGERS = {"Thumb": 3, "Index": 4, "Middle": 4, "Ring": 4, "Pinky": 4}
 
@@ -73,3 +76,16 @@ def nearest_ancestors(names: tuple[str, ...]) -> tuple[int, ...]:
             parent = PARENT_NAMES[parent]
         found.append(-1 if parent == "Root" else names.index(parent))
     return tuple(found)
+
+
+def other_side(name: str) -> str:
+    """Name of a joint's partner; of one in the middle its own."""
+    for side, other in (("Left", "Right"), ("Right", "Left")):
+        if name.startswith(side):
+            return other + name.removeprefix(side)
+    return name
+
+
+def other_sides(names: tuple[str, ...]) -> list[int]:
+    """Index of each joint's partner."""
+    return [names.index(other_side(name)) for name in names]

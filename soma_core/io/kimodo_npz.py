@@ -53,8 +53,9 @@ _SPREAD = {
 
 
 def read_kimodo_npz(
-    fields: NpzFields, *, fps: float | None, unit: str | None = None, person: str | None = None
-) -> Motion:
+    fields: NpzFields, *, fps: float | None, unit: str | None = None, person: str | None = None,
+    columns: bool = False,
+) -> Motion:  # fmt: skip
     """Read a kimodo motion (metres, +Y up, +Z forward; rotations relative to the T-pose).
 
     The local rotation of a joint is the transposed world rotation of its nearest stored ancestor times
@@ -66,6 +67,7 @@ def read_kimodo_npz(
         fps: frame rate, where it is not the usual one.
         unit: of lengths, where it is not the metre.
         person: which sample of a batch, from 0; needed where there are several.
+        columns: whether matrices are stored column by column.
 
     Raises:
         InputError: neither local nor world rotations are there, or a key has another layout.
@@ -81,6 +83,7 @@ def read_kimodo_npz(
             fix="Generate it with a SOMA model; of SMPL-X, kimodo_convert makes AMASS files.",
         )  # fmt: skip
     check_rotations(f"{fields.path}: {key}", stored)
+    stored = np.swapaxes(stored, -1, -2) if columns else stored
     names = _ORDERS[count]
     local = stored if key == "local_rot_mats" else _local_rotations(stored, names)
     metres = ANY_UNIT[unit or "m"]
@@ -183,27 +186,43 @@ def _skeleton(sample: _Sample, local: np.ndarray, names: tuple[str, ...], metres
     joints = _extra(sample, "posed_joints", (len(local), len(names), 3))
     if joints is None:
         return None
-    loose = 0
     few = np.unique(np.linspace(0, len(local) - 1, _MEASURED).astype(int))
-    joints, world = joints[few], local[few]
-    offsets = np.full((len(USER_JOINTS), 3), np.nan)
+    joints, world, most = joints[few], _world(local[few], names), len(names) // 10
+    offsets, loose = _bones(joints, world, names)
+    if loose <= most:
+        return metres * offsets
+    transposed = np.swapaxes(world, -1, -2), _world(np.swapaxes(local[few], -1, -2), names)
+    columns = any(_bones(joints, turned, names)[1] <= most for turned in transposed)
+    _log.warning(
+        "%s: posed_joints do not fit the rotations: %d bones change length or direction, %s",
+        sample.fields.path.name, loose,
+        "but do not if its matrices are stored column by column; pass rotation_layout=columns to soma convert"
+        if columns
+        else "as with axes of another hand, or another upward axis; write both with +y up",
+    )  # fmt: skip
+    return None
+
+
+def _world(local: np.ndarray, names: tuple[str, ...]) -> np.ndarray:
+    """World rotations (frames, J, 3, 3) of local ones."""
+    world = local.copy()
+    for index, ancestor in enumerate(nearest_ancestors(names)):
+        if ancestor >= 0:
+            world[:, index] = world[:, ancestor] @ world[:, index]
+    return world
+
+
+def _bones(joints: np.ndarray, world: np.ndarray, names: tuple[str, ...]) -> tuple[np.ndarray, int]:
+    """Bones (77, 3) of joints (frames, J, 3) turned by world rotations, and how many are not rigid."""
+    offsets, loose = np.full((len(USER_JOINTS), 3), np.nan), 0
     offsets[0] = 0
     for index, ancestor in enumerate(nearest_ancestors(names)):
-        if ancestor < 0:
+        if ancestor < 0 or PARENT_NAMES[names[index]] != names[ancestor]:
             continue
         turned = np.swapaxes(world[:, ancestor], -1, -2)
-        if PARENT_NAMES[names[index]] == names[ancestor]:
-            bone = (turned @ (joints[:, index] - joints[:, ancestor])[..., None])[..., 0]
-            offsets[USER_JOINTS.index(names[index])] = metres * np.median(bone, axis=0)
-            middle = np.median(bone, axis=0)
-            change = np.median(np.linalg.norm(bone - middle, axis=1))
-            loose += change > _RIGID * np.linalg.norm(middle)
-        world[:, index] = world[:, ancestor] @ world[:, index]
-    if loose > len(names) // 10:
-        _log.warning(
-            "%s: posed_joints do not fit the rotations: %d bones change length or direction, as with axes "
-            "of another hand, or another upward axis; write both with +y up",
-            sample.fields.path.name, loose,
-        )  # fmt: skip
-        return None
-    return offsets
+        bone = (turned @ (joints[:, index] - joints[:, ancestor])[..., None])[..., 0]
+        middle = np.median(bone, axis=0)
+        offsets[USER_JOINTS.index(names[index])] = middle
+        change = np.median(np.linalg.norm(bone - middle, axis=1))
+        loose += int(change > _RIGID * np.linalg.norm(middle))
+    return offsets, loose

@@ -60,6 +60,7 @@ def read_motion(
     convention: Convention | None = None,
     person: str | None = None,
     angles: Literal["rad", "deg"] | None = None,
+    columns: bool = False,
 ) -> Motion:
     """Read a motion from an NPZ file: our schema, the SOMA tools' files, kimodo's or GEM-X's.
 
@@ -70,6 +71,7 @@ def read_motion(
         convention: what zero means; overrides the file's own.
         person: which of the samples of kimodo or the people of GEM-X, from ``0``.
         angles: unit of rotation vectors; None for radians.
+        columns: whether matrices are stored column by column, or vectors were made of such.
 
     Returns:
         The motion in metres, +Y up, 77 joints with Hips first.
@@ -82,15 +84,17 @@ def read_motion(
         with open_data(path) as file:
             parts = gem_x_result(file)
             if parts is not None:
-                return gem_x_motion(parts, path=file.path, fps=fps, person=person)
+                return gem_x_motion(parts, path=file.path, fps=fps, person=person, columns=columns)
     with open_npz(path) as fields:
         if "global_rot_mats" in fields or "local_rot_mats" in fields:
-            return read_kimodo_npz(fields, fps=fps, unit=unit, person=person)
+            return read_kimodo_npz(fields, fps=fps, unit=unit, person=person, columns=columns)
         if "schema_version" in fields or ("poses" in fields and "transl" in fields):
-            return read_soma_npz(fields, fps=fps, unit=unit, convention=convention, angles=angles)
+            return read_soma_npz(
+                fields, fps=fps, unit=unit, convention=convention, angles=angles, columns=columns
+            )
         parts = gem_x_parts(fields)
         if parts is not None:
-            return gem_x_motion(parts, path=fields.path, fps=fps, person=person)
+            return gem_x_motion(parts, path=fields.path, fps=fps, person=person, columns=columns)
         raise fields.refuse(
             "layout",
             got=f"the keys {', '.join(fields.names) or '(none)'}",

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 __all__ = ["WIDTHS", "RotationLayout", "axis_angles", "split_shape"]
 
 RotationLayout = Literal["wxyz", "xyzw", "rows", "columns"]
-"""Order of quaternions, and whether six numbers are the first two rows or columns of a matrix."""
+"""Order of quaternions, and whether six or nine numbers are rows or columns of a matrix."""
 
 WIDTHS = (3, 4, 6, 9)
 """Numbers of one rotation: a vector, a quaternion, two rows or columns, a matrix."""
@@ -49,7 +49,8 @@ def axis_angles(values: np.ndarray, width: int, layout: RotationLayout | None) -
     Args:
         values: finite, or NaN where a frame is missing, which stays so.
         width: 3 vectors, 4 quaternions, 6 numbers of a matrix, 9 matrices.
-        layout: of quaternions and of six numbers; None to tell it.
+        layout: of quaternions and of six numbers, None to tell it; ``columns`` of matrices that are stored
+            column by column, and of vectors that were made of such.
 
     Raises:
         ValueError: no rotations, or a layout that cannot be told; the text says which.
@@ -57,7 +58,7 @@ def axis_angles(values: np.ndarray, width: int, layout: RotationLayout | None) -
     if width == 3:
         if np.nanmax(np.abs(values), initial=0) > _LARGEST:
             raise ValueError(f"angles of up to {np.nanmax(np.abs(values)):.3g} rad")
-        return values, "axis-angle"
+        return (-values if layout == "columns" else values), "axis-angle"
     flat = values.reshape(-1, width)
     whole = np.isfinite(flat).all(axis=1)
     if not whole.any():
@@ -68,6 +69,7 @@ def axis_angles(values: np.ndarray, width: int, layout: RotationLayout | None) -
         rotations, told = _from_six(flat[whole], layout)
     else:
         matrices = flat[whole].reshape(-1, 3, 3)
+        matrices = matrices.swapaxes(1, 2) if layout == "columns" else matrices
         _refuse_no_rotations(matrices)
         rotations, told = Rotation.from_matrix(matrices), "matrices"
     found = np.full((len(flat), 3), np.nan)

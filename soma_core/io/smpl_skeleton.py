@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import itertools
+from collections.abc import Iterator
+from dataclasses import replace
 from typing import Final
 
 import numpy as np
@@ -11,7 +14,7 @@ from soma_core.io.amass import SmplMotion
 from soma_core.io.skeleton_motion import SkeletonMotion
 from soma_core.rig.skeleton import Rig
 
-__all__ = ["smpl_skeleton"]
+__all__ = ["smpl_skeleton", "with_sides_swapped"]
 
 _BODY: Final[dict[str, tuple[str, tuple[float, float, float]]]] = {
     "pelvis": ("", (0, -0.22, 0.03)),
@@ -43,6 +46,28 @@ _FINGERS = ("index", "middle", "pinky", "ring", "thumb")
 _FACE = ("jaw", "left_eye", "right_eye")
 
 
+def with_sides_swapped(motion: SmplMotion) -> SmplMotion:
+    """A motion whose joints of the left are those that it calls right; nothing is mirrored."""
+    names = list(_BODY) + (["left_hand", "right_hand"] if motion.model == "smpl" else [])
+    names += _FACE if motion.model == "smplx" else ()
+    names += [] if motion.model == "smpl" else [name for name, _ in _fingers()]
+    sides = {"left": "right", "right": "left"}
+    other = ["_".join(sides.get(word, word) for word in name.split("_")) for name in names]
+    hands = motion.hand_components
+    return replace(
+        motion,
+        rotations=motion.rotations[:, [names.index(name) for name in other]],
+        hand_components=None if hands is None else np.roll(hands, hands.shape[1] // 2, axis=1),
+    )
+
+
+def _fingers() -> Iterator[tuple[str, str]]:
+    """Joints of the fingers in the order of SMPL-H, and the joints of this skeleton that they are."""
+    for side, finger, number in itertools.product(("left", "right"), _FINGERS, (1, 2, 3)):
+        target = f"{side.capitalize()}Hand{finger.capitalize()}{number + (finger != 'thumb')}"
+        yield f"{side}_{finger}{number}", target
+
+
 def smpl_skeleton(motion: SmplMotion, rig: Rig) -> SkeletonMotion:
     """Joints of a motion of SMPL, SMPL-H or SMPL-X on an average adult; betas are not read.
 
@@ -61,16 +86,11 @@ def smpl_skeleton(motion: SmplMotion, rig: Rig) -> SkeletonMotion:
             rest.append(rest[names.index("head")] + own[target] - own["Head"])
             parents.append(names.index("head"))
             names.append(name)
-    for side in ("left", "right") if motion.model != "smpl" else ():
-        hand = side.capitalize() + "Hand"
-        for finger in _FINGERS:
-            above = names.index(f"{side}_wrist")
-            for number in (1, 2, 3):
-                target = f"{hand}{finger.capitalize()}{number + (finger != 'thumb')}"
-                rest.append(rest[names.index(f"{side}_wrist")] + own[target] - own[hand])
-                parents.append(above)
-                above = len(names)
-                names.append(f"{side}_{finger}{number}")
+    for name, target in _fingers() if motion.model != "smpl" else ():
+        wrist = names.index(f"{name.partition('_')[0]}_wrist")
+        rest.append(rest[wrist] + own[target] - own[f"{name.partition('_')[0].capitalize()}Hand"])
+        parents.append(wrist if name.endswith("1") else len(names) - 1)
+        names.append(name)
     vectors = motion.rotations[:, : len(names)].astype(np.float64)
     rotations = Rotation.from_rotvec(vectors.reshape(-1, 3)).as_matrix().reshape(*vectors.shape, 3)
     return SkeletonMotion(

@@ -37,12 +37,14 @@ def read_soma_npz(
     unit: str | None,
     convention: Convention | None,
     angles: Literal["rad", "deg"] | None = None,
+    columns: bool = False,
 ) -> Motion:
     """Read a motion whose rotations are stored under ``poses``.
 
     Files without ``schema_version`` are those of the SOMA tools: they hold neither frame rate nor rig
     revision, may list the virtual Root first, and rotation vectors written by the reference converters
-    are doubled for angles up to 1e-3 rad (below what can be told apart from motion, so kept).
+    are doubled for angles up to 1e-3 rad (below what can be told apart from motion, so kept). With `columns`
+    matrices are stored column by column, or vectors were made of such.
 
     Raises:
         InputError: a key is missing, has another layout, or contradicts another key.
@@ -50,6 +52,7 @@ def read_soma_npz(
     _check_schema(fields)
     rotations = _rotations(fields, angles)
     rotations = rotations[:, _columns(fields, rotations)]
+    rotations = np.swapaxes(rotations, -1, -2) if columns else rotations
     metres = _metres(fields, unit)
     translation = fields.numbers("transl", (len(rotations), 3)) * metres
     ours = "schema_version" in fields

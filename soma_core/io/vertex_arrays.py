@@ -179,5 +179,14 @@ def _check_layout(path: Path, name: str, header: ArrayHeader) -> None:
             f"{path}: {name}",
             got=f"shape {header.shape}, dtype {header.dtype}{order}",
             expected="numbers (frames, vertices, 3) in C order, at least one frame",
-            fix="Save np.ascontiguousarray(vertices); one frame is vertices[None].",
+            fix=f"Save np.ascontiguousarray(vertices{_turn(header.shape)}); one frame is vertices[None].",
         )
+
+
+def _turn(shape: tuple[int, ...]) -> str:
+    """What brings coordinates to the end, before them the vertices, which are many."""
+    if len(shape) != 3 or 3 not in shape[:2]:
+        return ""
+    place = shape.index(3)
+    axes = [*sorted({0, 1, 2} - {place}, key=lambda axis: shape[axis]), place]
+    return f".transpose({', '.join(map(str, axes))})"

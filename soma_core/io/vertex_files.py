@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import Literal
 
 from soma_core.errors import InputError
 from soma_core.files import refuse_unreadable
@@ -27,7 +26,7 @@ def open_vertex_sequence(
     path: str | Path,
     *,
     fps: float | None = None,
-    unit: Literal["m", "cm", "mm"] | None = None,
+    unit: str | None = None,
     up: UpAxis | None = None,
     allow_references: bool = False,
 ) -> VertexSequence:

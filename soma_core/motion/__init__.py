@@ -40,7 +40,7 @@ if TYPE_CHECKING:
     from soma_core.motion.played import Played
     from soma_core.motion.products import write_body, write_products
     from soma_core.motion.quality import motion_quality
-    from soma_core.motion.retarget import retarget
+    from soma_core.motion.retargeting import retarget
     from soma_core.motion.shards import ShardsConverted, convert_dataset, convert_shards
     from soma_core.motion.writers import WriteOptions
     from soma_core.options import BackendChoice, FrameRange, IdentityChoice, InversionChoice, Picture
@@ -128,7 +128,7 @@ _HOMES = {
     "soma_core.motion.played": ["Played"],
     "soma_core.motion.products": ["write_body", "write_products"],
     "soma_core.motion.quality": ["motion_quality"],
-    "soma_core.motion.retarget": ["retarget"],
+    "soma_core.motion.retargeting": ["retarget"],
     "soma_core.motion.shards": ["ShardsConverted", "convert_dataset", "convert_shards"],
     "soma_core.motion.writers": ["WriteOptions"],
     "soma_core.options": ["BackendChoice", "FrameRange", "IdentityChoice", "InversionChoice", "Picture"],

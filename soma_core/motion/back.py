@@ -16,6 +16,7 @@ from soma_core.choices import Product, SmplLayout
 from soma_core.errors import InputError
 from soma_core.io.amass import SMPL_JOINTS
 from soma_core.json_file import read_json
+from soma_core.motion.bodies import other_way
 from soma_core.motion.chunks import FittedChunks
 from soma_core.motion.converter import Converted, earlier_report
 from soma_core.motion.files import ResultFiles, fingerprint, layout_of, no_motion, read
@@ -32,6 +33,7 @@ from soma_core.motion.options import ConvertOptions
 from soma_core.motion.played import MovingBodies, Played, placing_of
 from soma_core.motion.questions import heard, of_motion, of_params, say
 from soma_core.native import NativeFit, NativeTransfer, ParameterFit
+from soma_core.plugin.errors import BackendError
 from soma_core.plugin.registry import default_registry
 from soma_core.plugin.spec import HasSkinning, MotionFormat
 from soma_core.progress import progress
@@ -39,6 +41,11 @@ from soma_core.progress import progress
 __all__ = ["BackConverter"]
 
 _log = logging.getLogger(__name__)
+
+_OTHER_RESULT = (
+    "Only that file tells what the parameters do, no mesh of the model does. "
+    "Or leave result=poses out, for vertices, which need the wrap pair alone"
+)
 
 
 class BackConverter:
@@ -168,7 +175,10 @@ class BackConverter:
         name = self._options.to
         self._refuse_smpl_settings()
         if name not in self._targets:
-            self._targets[name] = ParameterFit(name, options=own.get("options"), **kind)
+            try:
+                self._targets[name] = ParameterFit(name, options=own.get("options"), **kind)
+            except BackendError as error:
+                raise other_way(error, _OTHER_RESULT) from error
         fit = self._targets[name]
         return ParameterTarget(
             fit=fit, errors=NativeErrors(fit.transfer, kind["lod"]), model=name, params=own.get("params")

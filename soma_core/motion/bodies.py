@@ -32,7 +32,7 @@ from soma_core.plugin.registry import default_registry
 if TYPE_CHECKING:
     from soma_core.plugin.spec import BackendSpec
 
-__all__ = ["FITTED", "ShownBody", "is_fitted", "open_body"]
+__all__ = ["FITTED", "ShownBody", "is_fitted", "open_body", "other_way"]
 
 _log = logging.getLogger(__name__)
 
@@ -324,8 +324,13 @@ def _with_way_out(backends: FitBackends, name: str, options: Mapping[str, Any], 
     try:
         return backends.get(name, options)
     except BackendError as error:
-        fix = f"{error.fix.rstrip('.')}. Or pass {other}"
-        raise BrokenBackendError(who=error.who, stage=error.stage, cause=error.cause, fix=fix) from error
+        raise other_way(error, f"Or pass {other}") from error
+
+
+def other_way(error: BackendError, other: str) -> BackendError:
+    """The refusal of a backend, with another way to go."""
+    fix = f"{error.fix.rstrip('.')}. {other}"
+    return BrokenBackendError(who=error.who, stage=error.stage, cause=error.cause, fix=fix)
 
 
 def _sought(options: ConvertOptions, backends: FitBackends) -> tuple[FitBackend, dict[str, Any]]:

@@ -10,15 +10,17 @@ from pathlib import Path
 import numpy as np
 
 from soma_core.choices import BoneMatch
-from soma_core.io.joint_names import read_mapping
+from soma_core.io.joint_names import match_joints, read_mapping
+from soma_core.io.joint_order import other_side
 from soma_core.io.motion import Motion
 from soma_core.io.skeleton_files import read_skeleton
 from soma_core.io.skeleton_motion import soma_skeleton
 from soma_core.io.smpl_skeleton import smpl_skeleton
 from soma_core.motion.foot_lock import Limb
+from soma_core.motion.movement import of_movement
 from soma_core.motion.options import ConvertOptions
 from soma_core.motion.questions import of_path, of_rate, of_smpl, say
-from soma_core.motion.retarget import Retargeted, retarget
+from soma_core.motion.retargeting import Retargeted, retarget
 from soma_core.motion.smpl_input import SMPL_LAYOUTS, smpl_choices, smpl_motion
 from soma_core.rig import load_canonical
 from soma_core.rig.skeleton import Rig
@@ -37,11 +39,12 @@ def carried(path: Path, layout: str, options: ConvertOptions) -> Retargeted:
     Raises:
         SomaError: the file cannot be read, or its joints are not known.
     """
-    up, match = options.upward, options.match
+    up, match, asked = options.upward, options.match, list[str]()
     if layout in SMPL_LAYOUTS:
         choices = replace(smpl_choices(options), gender="neutral", betas=(0.0,) * 10)
         motion = smpl_motion(path, options, choices)
-        say(path.name, of_smpl(motion))
+        asked = of_smpl(motion)
+        say(path.name, asked)
         _log.warning("%s: betas are not read: joints are carried over, no body is fitted", path.name)
         if motion.hand_components is not None and motion.hand_components.size:
             _log.warning("%s: hands are components of the model: the fingers stay straight", path.name)
@@ -49,6 +52,9 @@ def carried(path: Path, layout: str, options: ConvertOptions) -> Retargeted:
     else:
         source = read_skeleton(path, fps=options.fps, root=options.root, angles=options.angles)
     mapping = read_mapping(options.mapping) if options.mapping else None
+    if options.swap_sides and layout not in SMPL_LAYOUTS:
+        joints = match_joints(source.names, source.parents, mapping=mapping, source=source.source or "names")
+        mapping = {other_side(name): source.names[joint] for name, joint in joints.items()}
     found = retarget(
         source,
         mapping=mapping,
@@ -58,7 +64,10 @@ def carried(path: Path, layout: str, options: ConvertOptions) -> Retargeted:
     )
     if layout not in SMPL_LAYOUTS:
         moved = found.motion
-        say(path.name, of_rate(moved.fps) + of_path(moved.translation, moved.fps, up="+y", what="its path"))
+        told = of_path(moved.translation, moved.fps, up="+y", what="its path")
+        say(path.name, of_rate(moved.fps) + of_movement(moved, turns=("swap_sides",), told=told))
+    elif not asked:
+        say(path.name, of_movement(found.motion, turns=("swap_sides", "rotation_layout"), path=False))
     found = refined(found) if options.refine == "joints" else found
     left = found.report["not_carried"]
     if left:

@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from soma_core.choices import Smooth
 from soma_core.errors import InputError
-from soma_core.io.joint_order import USER_JOINTS
+from soma_core.io.joint_order import USER_JOINTS, other_sides
 from soma_core.io.motion import Motion
 from soma_core.motion.options import CleanOptions, LimbSeconds
 from soma_core.motion.quality import motion_quality, relative_rotations
@@ -219,7 +219,7 @@ def mirror(motion: Motion) -> Motion:
     Args:
         motion: any. Its body's parameters, which know no sides, are kept.
     """
-    flip, other = np.array([-1.0, 1.0, 1.0], np.float32), _other_side(motion.joint_names)
+    flip, other = np.array([-1.0, 1.0, 1.0], np.float32), other_sides(motion.joint_names)
     rotations = _reflected(relative_rotations(motion), other)
     if motion.convention == "absolute_local":
         rig = load_canonical("mid")[1]
@@ -243,7 +243,7 @@ def mirrored_body(layer: SomaLayer, identity: Identity) -> Identity:
         layer: whose mesh and rig the body is of.
         identity: any number of them; their parameters are kept, and are those of the body before.
     """
-    other = [0, *(1 + row for row in _other_side(USER_JOINTS))]
+    other = [0, *(1 + row for row in other_sides(USER_JOINTS))]
     partner = torch.as_tensor(layer.mesh.mirror.astype(np.int64), device=identity.rest.device)
     flip = identity.rest.new_tensor([-1.0, 1.0, 1.0])
     zero = torch.tensor(layer.rig.t_pose_world[:, :3, :3]).to(identity.rest)
@@ -279,15 +279,6 @@ def _reflected(rotations: np.ndarray, other: list[int]) -> np.ndarray:
     """``S R S`` of the joints of the other side; only signs change."""
     signs = np.outer([-1, 1, 1], [-1, 1, 1]).astype(rotations.dtype)
     return rotations[:, other] * signs
-
-
-def _other_side(names: tuple[str, ...]) -> list[int]:
-    """Index of each joint's partner; of one in the middle its own."""
-    swapped = [re.sub("^(Left|Right)", lambda side: _SIDES[side[0]], name) for name in names]
-    return [names.index(name) for name in swapped]
-
-
-_SIDES = {"Left": "Right", "Right": "Left"}
 
 
 def _limb(name: str) -> str | None:

@@ -15,7 +15,7 @@ from soma_core.io.motion_files import samples_of
 from soma_core.io.smpl_files import people_of
 from soma_core.motion.back import BackConverter
 from soma_core.motion.converter import Converted, Converter
-from soma_core.motion.files import ResultFiles, layout_of, read
+from soma_core.motion.files import ResultFiles, layout_of, read, turn_settings
 from soma_core.motion.options import ConvertOptions
 from soma_core.motion.poses import POSES, named_pose
 from soma_core.motion.questions import Names, of_motion, say
@@ -103,10 +103,13 @@ def _clip(
     if str(path) in POSES:
         return named_pose(str(path))
     path = expanded(path) if path else shipped_file("motions/range_of_motion.npz")
-    if layout_of(path) not in (None, "soma", "kimodo"):
+    layout = layout_of(path)
+    if layout not in (None, "soma", "kimodo"):
         return _converted(path, fps, person, unit, model)
     motion = read(path, fps=fps, unit=unit, person=person)
-    say(path.name, of_motion(motion, Names(unit="motion_unit", fps="motion_fps", ups=())))
+    turns = turn_settings(str(layout))
+    names = Names(unit="motion_unit", fps="motion_fps", ups=(), turns=turns, to=" to soma convert")
+    say(path.name, of_motion(motion, names))
     return motion
 
 

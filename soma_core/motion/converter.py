@@ -17,13 +17,13 @@ from soma_core.json_file import read_json
 from soma_core.motion.bodies import is_fitted, open_body
 from soma_core.motion.carried import carried
 from soma_core.motion.chunks import refuse_other_settings
-from soma_core.motion.files import Layout, ResultFiles, layout_of, no_motion, read, write
+from soma_core.motion.files import Layout, ResultFiles, layout_of, no_motion, read, turn_settings, write
 from soma_core.motion.fit_job import FitJob, FitPlan, fit_settings, plan_body
 from soma_core.motion.models import FitBackends
 from soma_core.motion.options import ConvertOptions, FitOptions, InvertOptions
 from soma_core.motion.pointed import from_points
 from soma_core.motion.products import BodyProducts
-from soma_core.motion.questions import heard, of_motion, say, unused_settings
+from soma_core.motion.questions import Names, heard, of_motion, say, unused_settings
 from soma_core.motion.smpl_input import SMPL_LAYOUTS
 from soma_core.paths import expanded
 
@@ -160,9 +160,9 @@ class Converter:
         options = self._options
         motion = read(
             path, fps=options.fps, unit=options.unit, angles=options.angles, convention=options.convention,
-            person=options.person,
+            person=options.person, rotation_layout=options.rotation_layout, swap_sides=options.swap_sides,
         )  # fmt: skip
-        say(path.name, of_motion(motion))
+        say(path.name, of_motion(motion, Names(turns=turn_settings(layout))))
         write(motion, files.motion)
         report = {
             "settings": {"input": str(path.resolve()), "layout": layout, "fps": motion.fps},

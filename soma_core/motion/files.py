@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import hashlib
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
-from soma_core.choices import LengthUnit, Product
+from soma_core.choices import LengthUnit, Product, RotationLayout
 from soma_core.errors import InputError, SomaError
 from soma_core.io.data_files import DATA_SUFFIXES, open_data
 from soma_core.io.gem_x import gem_x_parts, gem_x_result
+from soma_core.io.joint_order import other_sides
 from soma_core.io.json_frames import holds_pose_frames
 from soma_core.io.motion import Convention, Motion
 from soma_core.io.motion_files import read_motion, write_motion
@@ -39,6 +40,7 @@ __all__ = [
     "no_motion",
     "read",
     "read_model_motion",
+    "turn_settings",
     "write",
 ]
 
@@ -219,6 +221,8 @@ def read(
     person: str | None = None,
     angles: Literal["rad", "deg"] | None = None,
     convention: Convention | None = None,
+    rotation_layout: RotationLayout | str | None = None,
+    swap_sides: bool = False,
 ) -> Motion:
     """Read a motion on this skeleton: a file of this project, of the SOMA tools or of kimodo.
 
@@ -229,6 +233,8 @@ def read(
         person: which of the samples of kimodo or the people of GEM-X, from ``0``.
         angles: unit of rotation vectors; None for radians.
         convention: what zero means; overrides the file's own.
+        rotation_layout: ``columns`` where matrices are stored column by column; None for ``rows``.
+        swap_sides: whether what the file calls left is right.
 
     Raises:
         AssetError: the file is missing, damaged, a git-LFS pointer or no NPZ.
@@ -239,7 +245,32 @@ def read(
             "unit", got=repr(unit), expected=f"one of {', '.join(METRES)}", fix="Correct the name."
         )
     name = None if unit is None else str(unit)
-    return read_motion(path, fps=fps, unit=name, angles=angles, convention=convention, person=person)
+    if rotation_layout is not None and rotation_layout not in ("rows", "columns"):
+        raise InputError(
+            "rotation_layout", got=str(rotation_layout), expected="rows or columns, of matrices",
+            fix="Leave rotation_layout out.",
+        )  # fmt: skip
+    motion = read_motion(
+        path, fps=fps, unit=name, angles=angles, convention=convention, person=person,
+        columns=rotation_layout == "columns",
+    )  # fmt: skip
+    return _with_sides_swapped(motion) if swap_sides else motion
+
+
+def turn_settings(layout: str) -> tuple[str, ...]:
+    """Settings of :func:`read` that read the rotations of a layout otherwise."""
+    return ("rotation_layout", "swap_sides", *(("convention",) if layout == "soma" else ()))
+
+
+def _with_sides_swapped(motion: Motion) -> Motion:
+    """A motion whose joints of the left are those that it calls right; nothing is mirrored."""
+    other = other_sides(motion.joint_names)
+    return replace(
+        motion,
+        rotations=motion.rotations[:, other],
+        contacts=None if motion.contacts is None else motion.contacts[:, [2, 3, 0, 1]],
+        skeleton=None if motion.skeleton is None else motion.skeleton[other],
+    )
 
 
 def write(motion: Motion, path: str | Path) -> None:

@@ -17,6 +17,7 @@ from soma_core.cache import atomic_text, atomic_write
 from soma_core.choices import Upward
 from soma_core.errors import InputError, SomaError
 from soma_core.inversion.diagnosis import Diagnosis, diagnose_fit
+from soma_core.io.motion import Motion
 from soma_core.io.motion_files import write_motion_parts
 from soma_core.motion.bodies import ShownBody, open_body
 from soma_core.motion.chunks import FittedChunks
@@ -25,8 +26,10 @@ from soma_core.motion.fit_results import chunk_arrays, draw_worst, fitted_motion
 from soma_core.motion.ground import skeleton_of
 from soma_core.motion.identities import found_identity, stored_identity
 from soma_core.motion.models import model_settings
+from soma_core.motion.movement import LOOKED, of_movement
 from soma_core.motion.options import FitOptions
 from soma_core.motion.questions import heard, of_path, say
+from soma_core.motion.smpl_input import SMPL_LAYOUTS
 from soma_core.progress import progress
 
 if TYPE_CHECKING:
@@ -238,10 +241,32 @@ class FitJob:
             ]
         if found is not None and not found.failed and found.cause != "axis":
             doubts.append(found.sentence)
-        if plan.layout != "amass" and valid.sum() > 1:  # its path was asked about before the fit
+        smpl = plan.layout in SMPL_LAYOUTS  # its path was asked about before the fit
+        told = []
+        if not smpl and valid.sum() > 1:
             path = np.concatenate([path for (path,) in plan.chunks.load_all("translation")])[valid]
-            doubts += of_path(path, plan.settings["fps"], up="+y", what="the fit")
+            told = of_path(path, plan.settings["fps"], up="+y", what="the fit")
+        known = len(valid) if valid.all() else int(np.argmin(valid))
+        if known and not any("angles=deg" in doubt for doubt in self.body.doubts):
+            turns = ("rotation_layout", "swap_sides") if smpl else ()
+            doubted = bool(self.body.doubts) or (found is not None and found.cause == "axis")
+            doubts += of_movement(self._begin(known), turns=turns, told=told, path=not doubted)
         say(plan.source.name, doubts)
+
+    def _begin(self, known: int) -> Motion:
+        """The first frames of what was fitted, `known` of them at most, on the body's skeleton."""
+        count, layer = min(known, LOOKED), self.body.backend.layer
+        loaded, parts = 0, []
+        for part in self.plan.chunks.load_all("rotations", "translation"):
+            parts.append(part)
+            loaded += len(part[0])
+            if loaded >= count:
+                break
+        rotations, path = (np.concatenate(each)[:count] for each in zip(*parts, strict=True))
+        return Motion(
+            rotations=rotations, translation=path, fps=self.plan.settings["fps"],
+            joint_names=layer.joint_names, skeleton=skeleton_of(layer.rig, self.identity),
+        )  # fmt: skip
 
     def _diagnosis(self, errors: np.ndarray) -> Diagnosis | None:
         """What is wrong with the fit, by some of its frames and their mean errors [m], NaN where unusable."""

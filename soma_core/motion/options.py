@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, fields
-from typing import TYPE_CHECKING, Any, cast
+from typing import Any
 
 from soma_core.choices import (
     AngleUnit,
@@ -38,9 +38,6 @@ from soma_core.io.vertex_sequence import UpAxis
 from soma_core.motion.writers import MESH_WRITERS, WriteOptions
 from soma_core.options import BackendChoice, IdentityChoice, InversionChoice, ModelOptions, Options, Picture
 from soma_core.topology.frames import METRES
-
-if TYPE_CHECKING:
-    from soma_core.plugin.spec import Unit
 
 __all__ = [
     "CleanOptions", "ConvertOptions", "DatasetOptions", "FitOptions", "InvertOptions", "LimbSeconds",
@@ -84,9 +81,9 @@ class SourceOptions(Options):
         return None if self.up is None else SIGNED[str(self.up)]
 
     @property
-    def unit_name(self) -> Unit | None:
+    def unit_name(self) -> str | None:
         """The unit as readers take it."""
-        return None if self.unit is None else cast("Unit", str(self.unit))
+        return None if self.unit is None else str(self.unit)
 
     @property
     def metres(self) -> float | None:
@@ -162,7 +159,9 @@ class ConvertOptions(WriteOptions, FitOptions):
         model: of the SMPL family, that a file's poses are of; None: as the file tells.
         person: whose motion, in a file of several people; ``all`` for a motion of each.
         coordinates: the motion in the world or in the camera; None: the world where the file has it.
-        rotation_layout: of quaternions and 6D rotations; None: as the numbers tell.
+        rotation_layout: of quaternions and 6D rotations, None: as the numbers tell; ``columns`` for matrices
+            that are stored column by column.
+        swap_sides: whether what a file calls left is right.
         flat_hand_mean: whether zero is a flat hand; None: as the file says, or flat.
         gaps: what becomes of frames that a file lacks or where it holds NaN.
         longest_gap: that is interpolated [s].
@@ -199,6 +198,7 @@ class ConvertOptions(WriteOptions, FitOptions):
     person: str | None = None
     coordinates: Coordinates | None = None
     rotation_layout: RotationLayout | None = None
+    swap_sides: bool = False
     flat_hand_mean: bool | None = None
     gaps: Gaps = Gaps.interpolate
     longest_gap: float = 1.0
@@ -224,6 +224,7 @@ class ConvertOptions(WriteOptions, FitOptions):
         sought = None if self.identity.method == "known" else str(self.identity.method)
         unused: dict[str, object] = {"identity.method": sought, "most_betas": self.most_betas}
         unused |= {name: getattr(self, name) for name in ("model", "coordinates", "rotation_layout")}
+        unused["swap_sides"] = self.swap_sides or None
         why = f"to={self.to}"
         if self.to == "soma":
             placed = None if self.translation == "motion" or self.shown else str(self.translation)

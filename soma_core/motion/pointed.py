@@ -195,7 +195,7 @@ def _told_unit(path: Path, positions: np.ndarray) -> float:
             str(path), got=f"all points at one place, in {len(extents)} frames",
             expected="points of a person", fix="Look at how the file was written.",
         )  # fmt: skip
-    for unit in ("m", "cm", "mm"):
+    for unit in METRES:
         if 0.4 < extent * METRES[unit] < 2.6:
             if unit != "m":
                 say(path.name, [f"points span {extent:.4g}: taken for {unit}; if they are not, pass unit=m"])
@@ -206,7 +206,7 @@ def _told_unit(path: Path, positions: np.ndarray) -> float:
 def _unit_error(path: Path, error: InputError, metres: float) -> InputError:
     return InputError(
         f"{path.name}: unit", got=f"{error.got}, in units of {metres:g} m", expected="a person",
-        fix="Pass unit=m, cm or mm as the points are stored, or backend.params of a body of that size.",
+        fix="Pass unit= as the points are stored (m, cm, mm, inch, ft), or backend.params of such a body.",
     )  # fmt: skip
 
 

@@ -11,7 +11,7 @@ from soma_core.errors import InputError
 from soma_core.io.vertex_sequence import UpAxis, VertexSequence
 from soma_core.rig import load_canonical
 from soma_core.topology.correspondence import load_correspondence
-from soma_core.topology.frames import METRES, native_to_canonical
+from soma_core.topology.frames import METRES, METRIC, native_to_canonical
 
 if TYPE_CHECKING:
     from soma_core.layer import SomaLayer
@@ -31,6 +31,10 @@ _NEARBY = 4
 _SAME_SIZE, _OTHER_AGE = 3.0, 5.0
 """A body curls up to half its extent; three times more or less is another unit, if there is one that fits, or
 an adult in place of a newborn, and five times no body."""
+
+
+_RARE = 1.3
+"""How close inches and feet must be, to be taken for the unit: a child in centimetres is larger in inches."""
 
 
 class PosedInput:
@@ -121,12 +125,15 @@ class PosedInput:
         told = _metres(self.sequence, layer, self.topology)
         name = next((unit for unit, metres in METRES.items() if metres == told), f"units of {told:g} m")
         off = {unit: abs(np.log(sizes[0] / told * metres / expected)) for unit, metres in METRES.items()}
-        fitting = min(METRES, key=lambda unit: off[unit])
+        fitting = min(
+            (unit for unit in METRES if unit in METRIC or off[unit] < np.log(_RARE)),
+            key=lambda unit: off[unit],
+        )
         close = off[fitting] < np.log(_SAME_SIZE)
         if not close and abs(np.log(sizes[0] / expected)) < np.log(_OTHER_AGE):
             return
         mend = f"If the file is in {fitting}, pass unit={fitting}"
-        other = "m, cm and mm do not fit: look at backend= and its parameters, or at the scale of the export"
+        other = "No unit fits: look at backend= and its parameters, or at the scale of the export"
         raise InputError(
             str(self.sequence.path),
             got=f"a body {sizes[0] / expected:.3g} times as large as its identity, for lengths in {name}",
@@ -167,11 +174,14 @@ def _check_count(
     wanted = (counts["native"],) if topology == "native" else (counts["mid"], counts["low"])
     if count not in wanted:
         known = ", ".join(f"{number} ({name})" for name, number in counts.items())
+        turned = sequence.frame_count in counts.values()
         raise InputError(
             str(sequence.path),
             got=f"{count} vertices",
             expected=f"one of {known} for backend {layer.backend!r}",
-            fix="Pass backend=NAME of their model; export each vertex once, neither merged nor split.",
+            fix="Frames and vertices are exchanged: save np.ascontiguousarray(vertices.transpose(1, 0, 2))."
+            if turned
+            else "Pass backend=NAME of their model; export each vertex once, neither merged nor split.",
         )
     if topology == "canonical" and lod == "mid" and count != counts["mid"]:
         raise InputError(

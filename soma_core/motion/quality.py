@@ -7,13 +7,13 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from soma_core.inversion.point_priors import JointPrior
+from soma_core.inversion.point_priors import JointPrior, JointRange
 from soma_core.io.joint_order import CONTACT_JOINTS, USER_JOINTS
 from soma_core.io.motion import Motion
 from soma_core.motion.ground import FootTrack, contacts_of, floor_height, rest_offsets
 from soma_core.rig import load_canonical
 
-__all__ = ["joint_places", "motion_quality", "relative_rotations"]
+__all__ = ["joint_places", "motion_quality", "relative_rotations", "turns_about"]
 
 _FAR = 3.0
 """Standard deviations of a joint's expected turn beyond which it is out of its range."""
@@ -94,13 +94,27 @@ def _joint_range(motion: Motion) -> dict[str, dict[str, float]]:
         known = prior.range_of(name)
         if known is None:
             continue
-        rest = Rotation.from_rotvec(known.rest, degrees=True)
-        turns = Rotation.from_matrix(relative[:, row]) * rest.inv()
-        vectors = np.degrees(turns.as_rotvec())
-        axis = np.asarray(known.axis) / np.linalg.norm(known.axis)
-        about = vectors @ axis
-        across = np.linalg.norm(vectors - about[:, None] * axis, axis=1)
+        about, across = turns_about(known, relative[:, row])
         far = np.hypot(about / known.spread[0], across / known.spread[1])
         if far.max() > _FAR:
             found[name] = {"share": float((far > _FAR).mean()), "deviations": float(far.max())}
     return found
+
+
+def turns_about(
+    known: JointRange, turned: np.ndarray, *, expected: bool = True
+) -> tuple[np.ndarray, np.ndarray]:
+    """Turns [degrees] about a joint's axis, and across it, of rotations (frames, 3, 3) from the T-pose.
+
+    Args:
+        known: the joint's range.
+        turned: rotations.
+        expected: whether they are measured from where the joint is expected, or from the T-pose.
+    """
+    turns = Rotation.from_matrix(turned)
+    if expected:
+        turns = turns * Rotation.from_rotvec(known.rest, degrees=True).inv()
+    vectors = np.degrees(turns.as_rotvec())
+    axis = np.asarray(known.axis) / np.linalg.norm(known.axis)
+    about = vectors @ axis
+    return about, np.linalg.norm(vectors - about[:, None] * axis, axis=1)

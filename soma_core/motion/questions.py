@@ -19,8 +19,10 @@ from soma_core.io.amass import SmplMotion
 from soma_core.io.motion import Motion
 from soma_core.io.rotation_vectors import degrees_doubt
 from soma_core.io.vertex_sequence import UpAxis
+from soma_core.motion.movement import of_movement
 from soma_core.motion.options import SIGNED, ConvertOptions
 from soma_core.motion.posed_input import world_axes
+from soma_core.motion.source_skeleton import likely_unit
 from soma_core.plugin.spec import BackendSpec, Unit
 from soma_core.rig import load_canonical
 from soma_core.topology.frames import METRES
@@ -57,6 +59,9 @@ or measured from its first frame, has exact zeros or goes below."""
 _HIPS = (0.05, 1.5)
 """Lowest heights of hips in a clip [m]: from a newborn that lies to a giant who stands."""
 
+_ADULT = (0.75, 1.2)
+"""Heights of an adult's hips [m], where a child's in centimetres are an adult's in inches."""
+
 _SPAN, _LEAP, _USUAL = 0.5, 10.0, 12.5
 """Half a second [s], how far nobody gets in it or in less [m], and the speed of the best sprinters [m/s]."""
 
@@ -84,11 +89,16 @@ _FAR = 0.5
 
 @dataclass(frozen=True, kw_only=True)
 class Names:
-    """What the settings are called that mend a reading; empty where there is none."""
+    """What the settings are called that mend a reading; empty where there is none.
+
+    `turns` are those of its rotations, and `to` the command that has them, where it is another.
+    """
 
     unit: str = "unit"
     fps: str = "fps"
     ups: Collection[str] = field(default_factory=lambda: tuple(SIGNED))
+    turns: Collection[str] = ()
+    to: str = ""
 
 
 def say(source: str, doubts: Collection[str]) -> None:
@@ -146,7 +156,12 @@ def of_motion(motion: Motion, names: Names | None = None) -> list[str]:
         hips = hips @ load_canonical("mid")[1].t_pose_world[1, :3, :3].T
     lies = _of_axes(hips[:, :, 1], "+y", names.ups)
     path = of_path(motion.translation, motion.fps, up="+y", what="the path of the Hips", names=names)
-    return of_rate(motion.fps, names) + _of_persons(motion) + _of_legs(motion, names) + (lies or path)
+    legs = _of_legs(motion, names)
+    moves = of_movement(
+        motion, unit=names.unit, fps=names.fps, turns=names.turns, to=names.to,
+        path=not (lies or legs), told=[] if lies else path,
+    )  # fmt: skip
+    return of_rate(motion.fps, names) + _of_persons(motion) + legs + (lies + moves)
 
 
 def of_rate(fps: float, names: Names | None = None) -> list[str]:
@@ -204,7 +219,9 @@ def of_path(
         told.append(f"moves it at up to {speed:,.4g} m/s")
     rate = "" if units else f", and if the frame rate is wrong, {names.fps}=30 (the true rate)"
     units = units or [unit for unit in _SMALLER if speed * METRES[unit] < _USUAL] or ["cm"]
-    mend = f"if the lengths are in {units[0]}, pass {names.unit}={units[0]}{rate}"
+    inches = _ADULT[0] < lowest * METRES["inch"] < _ADULT[1] and units[0] == "cm"
+    also = f" (or in inches, {names.unit}=inch)" if inches else ""
+    mend = f"if the lengths are in {units[0]}{also}, pass {names.unit}={units[0]}{rate}"
     found = [f"{what} {' and '.join(told)}; {mend}"] if told else []
     if leap is not None:
         cut = "if two recordings follow each other there, cut the file"
@@ -264,10 +281,9 @@ def _of_legs(motion: Motion, names: Names) -> list[str]:
     legs = float(lengths.sum() / 2)
     if not np.isfinite(legs) or _LEGS[0] < legs < _LEGS[1]:
         return []
-    fitting = [unit for unit, metres in METRES.items() if unit != "m" and _LEGS[0] < legs * metres < _LEGS[1]]
-    mend = (
-        f"pass {names.unit}={fitting[0]}" if fitting else f"pass {names.unit}=m, cm or mm as they are stored"
-    )
+    unit = likely_unit(legs)
+    name = unit[0] if unit is not None and unit[0] in METRES else "m, cm, mm, inch or ft as they are stored"
+    mend = f"pass {names.unit}={name}"
     return [f"its legs are {legs:.3g} m long; if the lengths are in another unit, {mend}"]
 
 
@@ -296,10 +312,12 @@ def of_params(spec: BackendSpec, params: Mapping[str, Any], *, setting: str = "b
 _SMPL, _KEPT = frozenset({"amass", "smpl"}), frozenset({"soma", "kimodo"})
 
 _APPLY: dict[str, frozenset[str]] = dict.fromkeys(
-    ("gender", "most_betas", "betas", "betas_from", "model", "coordinates", "rotation_layout",
+    ("gender", "most_betas", "betas", "betas_from", "model", "coordinates",
      "flat_hand_mean", "gaps", "longest_gap", "carry"), _SMPL,
 ) | {
     "person": _SMPL | _KEPT,
+    "rotation_layout": _SMPL | _KEPT,
+    "swap_sides": _SMPL | _KEPT | {"skeleton"},
     "angles": _SMPL | {"soma", "skeleton"},
     "convention": frozenset({"soma"}),
     "up": _SMPL | {"sam3d", "skeleton"},

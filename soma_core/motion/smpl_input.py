@@ -10,6 +10,7 @@ from typing import Any
 from soma_core.io.amass import SmplMotion
 from soma_core.io.rotation_vectors import in_radians
 from soma_core.io.smpl_files import SmplChoices, read_smpl
+from soma_core.io.smpl_skeleton import with_sides_swapped
 from soma_core.motion.options import ConvertOptions
 
 __all__ = ["SMPL_LAYOUTS", "chosen_reading", "smpl_choices", "smpl_motion"]
@@ -31,6 +32,7 @@ def smpl_motion(path: Path, options: ConvertOptions, choices: SmplChoices) -> Sm
         SomaError: the file cannot be read.
     """
     motion = read_smpl(path, choices)
+    motion = with_sides_swapped(motion) if options.swap_sides else motion
     return replace(
         motion,
         rotations=in_radians(path, motion.rotations, options.angles),
@@ -54,4 +56,5 @@ def chosen_reading(options: ConvertOptions) -> dict[str, Any]:
     """Settings of the reading that are not those of every file, for the report."""
     plain = SmplChoices()
     read = vars(smpl_choices(options))
-    return {name: read[name] for name in _SETTINGS if name != "gender" and read[name] != getattr(plain, name)}
+    names = [name for name in _SETTINGS if name != "gender" and read[name] != getattr(plain, name)]
+    return {name: read[name] for name in names} | ({"swap_sides": True} if options.swap_sides else {})

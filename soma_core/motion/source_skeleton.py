@@ -10,21 +10,22 @@ import numpy as np
 
 from soma_core.errors import InputError
 from soma_core.io.skeleton_motion import SkeletonMotion
-from soma_core.topology.frames import METRES
+from soma_core.topology.frames import METRES, METRIC
 
-__all__ = ["Placed", "chains", "legs_and_trunk", "placed", "tail", "unit_vector"]
+__all__ = ["Placed", "chains", "legs_and_trunk", "likely_unit", "placed", "tail", "unit_vector"]
 
 _log = logging.getLogger(__name__)
 
 _UNITS = (
-    *((name, metres, 0.55, 1.4) for name, metres in METRES.items()),
-    ("inches", 0.0254, 0.7, 1.05),
-    ("units of 56 mm, as CMU's", 0.0254 / 0.45, 0.7, 1.05),
-    *((name, metres, 0.2, 2.0) for name, metres in METRES.items()),
+    *((name, METRES[name], 0.55, 1.4) for name in METRIC),
+    ("inch", METRES["inch"], 0.7, 1.05),
+    ("ft", METRES["ft"], 0.7, 1.05),
+    ("units of 56 mm, as CMU's", METRES["inch"] / 0.45, 0.7, 1.05),
+    *((name, METRES[name], 0.2, 2.0) for name in METRIC),
 )
 """Units and the legs, thigh and shin, that speak for them [m]; the first that fits is taken.
 
-Children under six in centimetres have legs like adults in inches, which are more."""
+Children under six in centimetres have legs like adults in inches, who are more."""
 
 _ANY_LEGS = (0.15, 2.0)
 """Legs [m] that leave a unit standing which the file tells."""
@@ -147,8 +148,8 @@ def _warn_mirrored(source: SkeletonMotion, match: Mapping[str, int]) -> None:
                 found += float(ahead @ unit_vector(rest[match[toe]] - rest[match[foot]]))
     if found < -_STANDING:
         _log.warning(
-            "%s: its toes point backwards, if left is left: the names of the sides are exchanged, and "
-            "mapping=FILE tells which joint is which, or it has axes of a left hand",
+            "%s: its toes point backwards, if left is left: the names of the sides are exchanged, which "
+            "swap_sides=true (or mapping=FILE) mends, or it has axes of a left hand",
             source.source,
         )  # fmt: skip
 
@@ -199,6 +200,12 @@ def unit_vector(vector: np.ndarray) -> np.ndarray:
     return np.asarray(vector / max(float(np.linalg.norm(vector)), 1e-12))
 
 
+def likely_unit(legs: float) -> tuple[str, float] | None:
+    """Name and length [m] of the unit that a person's thigh and shin are `legs` in; None where none is."""
+    fitting = ((name, metres) for name, metres, least, most in _UNITS if least <= legs * metres <= most)
+    return next(fitting, None)
+
+
 def _metres(source: SkeletonMotion, match: Mapping[str, int]) -> float:
     """Length of the unit, told by the legs."""
     lengths = []
@@ -219,21 +226,21 @@ def _metres(source: SkeletonMotion, match: Mapping[str, int]) -> float:
     legs = float(np.mean(lengths))
     if source.metres is not None and _ANY_LEGS[0] <= legs * source.metres <= _ANY_LEGS[1]:
         return source.metres
-    for name, metres, least, most in _UNITS:
-        if least <= legs * metres <= most:
-            usual = name in METRES and source.metres is None
-            _log.log(
-                logging.INFO if usual else logging.WARNING,
-                "%s: legs of %.3g are read as %s, %.2f m; unit= says another",
-                source.source,
-                legs,
-                name,
-                legs * metres,
-            )
-            return metres
+    told = likely_unit(legs)
+    if told is not None:
+        name, metres = told
+        _log.log(
+            logging.INFO if name in METRIC and source.metres is None else logging.WARNING,
+            "%s: legs of %.3g are read as %s, %.2f m; unit= says another",
+            source.source,
+            legs,
+            name,
+            legs * metres,
+        )
+        return metres
     raise InputError(
         f"{source.source}: unit",
         got=f"legs of {legs:.3g}",
-        expected=f"{_ANY_LEGS[0]} to {_ANY_LEGS[1]} m in m, cm, mm or inches",
-        fix="Pass unit=m, cm or mm.",
+        expected=f"{_ANY_LEGS[0]} to {_ANY_LEGS[1]} m in m, cm, mm, inches or feet",
+        fix="Pass unit=m, cm, mm, inch or ft.",
     )

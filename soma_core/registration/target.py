@@ -15,7 +15,7 @@ from soma_core.errors import InputError
 from soma_core.geometry.mesh import enclosed_volume
 from soma_core.plugin.spec import Axis, Unit
 from soma_core.registration.surface import Surface
-from soma_core.topology.frames import METRES, native_to_canonical
+from soma_core.topology.frames import METRES, METRIC, native_to_canonical
 
 _log = logging.getLogger(__name__)
 
@@ -248,8 +248,8 @@ def find_unit(extent: float) -> Unit:
     Raises:
         InputError: no unit fits.
     """
-    for unit, metres in METRES.items():
-        if _STATURES[0] <= extent * metres <= _STATURES[1]:
+    for unit in METRIC:
+        if _STATURES[0] <= extent * METRES[unit] <= _STATURES[1]:
             return unit
     raise _refusal(
         f"a longest side of {extent:.4g}",

@@ -7,10 +7,13 @@ import numpy as np
 from soma_core.errors import InputError
 from soma_core.plugin.spec import Axis, Unit
 
-__all__ = ["ANY_UNIT", "METRES", "METRES_PER_UNIT", "native_to_canonical"]
+__all__ = ["ANY_UNIT", "METRES", "METRES_PER_UNIT", "METRIC", "native_to_canonical"]
 
-METRES: dict[Unit, float] = {"m": 1.0, "cm": 0.01, "mm": 0.001}
-"""Length of one native unit in metres."""
+METRES: dict[str, float] = {"m": 1.0, "cm": 0.01, "mm": 0.001, "inch": 0.0254, "ft": 0.3048}
+"""Length of one unit in metres, of a backend's first."""
+
+METRIC: tuple[Unit, ...] = ("m", "cm", "mm")
+"""Units that are taken without being told; inches and feet only where nothing else fits."""
 
 METRES_PER_UNIT = {"meters": METRES["m"], "centimeters": METRES["cm"], "millimeters": METRES["mm"]}
 """The same by the names that files of the SOMA tools have for them."""

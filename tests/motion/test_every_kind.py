@@ -25,7 +25,7 @@ from soma_core.motion import (
     write,
     write_body,
 )
-from soma_core.motion.retarget import retarget
+from soma_core.motion.retargeting import retarget
 from tests.fbx_files import write_fbx
 from tests.io.smpl_layouts import TURNS, save_joblib, save_npy, save_pt, smplx_names, wham
 from tests.motion.test_retarget import MIXAMO, SAME_DEGREES, bones_apart
@@ -57,7 +57,7 @@ def test_a_vrm_tells_its_joints_by_the_bones_of_a_human(version, tmp_path):
     places = [found.names.index(HUMAN[name]) for name in motion.names]
     np.testing.assert_allclose(found.positions()[:, places], motion.positions(), atol=EXACT)
     np.testing.assert_allclose(found.rest[places], motion.rest, atol=EXACT)
-    carried = retarget(found)
+    carried = retarget(found, match="bones")
     assert {"spine", "chest", "upperChest"} == set(carried.report["spine"])
     assert not carried.report["not_carried"]
     apart = bones_apart(found, carried, load_canonical("mid")[1])
@@ -158,7 +158,7 @@ def test_files_of_the_soma_retargeter_rest_as_the_rig_does(name):
     if package is None:
         pytest.skip("needs eden-soma-retargeter")
     source = read_skeleton(Path(package.origin).parent / "configs/soma" / name)
-    found = retarget(source)
+    found = retarget(source, match="bones")
     assert found.report["not_carried"] == ["Root"]
     assert set(found.report["joints"].values()) <= set(USER_JOINTS)
     # A later revision of the rig: rotations carry over, and its bones lie some degrees elsewhere.

@@ -20,7 +20,7 @@ from soma_core.io.skeleton_motion import soma_skeleton
 from soma_core.layer import SomaLayer
 from soma_core.motion import ConvertOptions, FrameRange, convert_file, load_clip, write_body
 from soma_core.motion.carried import refined
-from soma_core.motion.retarget import retarget
+from soma_core.motion.retargeting import retarget
 from tests.skeletons import along_axes, biped, in_another_pose, moved
 
 FLAT_DEGREES = 1.0
@@ -148,7 +148,7 @@ def bones_apart(source, found, rig):
 @pytest.mark.parametrize("make", SOURCES, ids=["lafan", "mixamo", "xsens", "100style", "unreal"])
 def test_bones_point_the_same_way(make, rig):
     source = make()
-    apart = bones_apart(source, retarget(source), rig)
+    apart = bones_apart(source, retarget(source, match="bones"), rig)
     assert len(apart) >= 13
     assert max(apart.values()) < SAME_DEGREES, apart
 

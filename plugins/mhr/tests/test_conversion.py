@@ -7,7 +7,15 @@ import pytest
 import torch
 
 from soma_core import AssetError, BackendError, InputError, read_motion
-from soma_core.motion import BackendChoice, ConvertOptions, IdentityChoice, convert_file
+from soma_core.motion import (
+    BackendChoice,
+    ConvertOptions,
+    FrameRange,
+    IdentityChoice,
+    convert_file,
+    load_clip,
+    write,
+)
 from soma_core.plugin import Registry
 from tests.standins.mhr_files import StandIn, mhr_body
 
@@ -80,3 +88,14 @@ def test_what_is_missing_is_said(data_folder, person, tmp_path, monkeypatch):
         converted(tmp_path, person, trusted=False, identity=IdentityChoice(method="backend"))
     with pytest.raises(BackendError, match=r"missing.*mhr_model_lod1\.pt.*Or pass identity=unknown"):
         converted(tmp_path, person)
+
+
+def test_parameters_without_the_model_are_refused_with_what_goes_without(tmp_path, monkeypatch):
+    monkeypatch.setenv("SOMA_DATA_DIR", str(tmp_path))
+    monkeypatch.setattr("soma_core.native.parameters.default_registry", Registry)
+    write(load_clip(frames=FrameRange(stop=1)), tmp_path / "clip.npz")
+    options = ConvertOptions(to="mhr", result="poses", lod="low", backend=BackendChoice(name="soma"))
+    with pytest.raises(
+        BackendError, match=r"mhr_model_lod1\.pt.*no mesh of the model does.*leave result=poses out"
+    ):
+        convert_file(tmp_path / "clip.npz", tmp_path / "out", options=options)

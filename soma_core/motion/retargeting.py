@@ -45,7 +45,7 @@ def retarget(
     mapping: Mapping[str, str] | None = None,
     unit: str | None = None,
     up: str | None = None,
-    match: Literal["bones", "soles", "limbs"] | str = "bones",
+    match: Literal["bones", "soles", "limbs"] | str = "soles",
 ) -> Retargeted:
     """Carry the motion of another skeleton over to this one.
 
@@ -63,7 +63,7 @@ def retarget(
         mapping: name of a joint here -> its name there, where names are not known.
         unit: of the source's lengths, ``m``, ``cm`` or ``mm``; None: told by the length of the legs.
         up: upward axis of the source's world, as ``y`` or ``-z``; None: told by its rest pose.
-        match: ``bones``: all of them; ``soles``: all but the slope of feet, which are as flat as there;
+        match: ``soles``: all but the slope of feet that stand flat, which do so here; ``bones``: all of them;
             ``limbs``: arms, legs and fingers; the trunk keeps its shape where the source rests as a human.
 
     Raises:
