@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import product
 from typing import cast
 
@@ -62,19 +62,27 @@ def find_starts(
     tried = [(*each, *body) for each in zip(surfaces, frames, strict=True) for body in bodies]
     costs = [_start(*each, model, _ROUGHLY).cost for each in tried]
     best = [tried[index] for index in np.argsort(costs, kind="stable")[: max(_LEFT, count)]]
-    starts = [_start(surface, frame, pose, body, model, _SAMPLES) for surface, frame, pose, body in best]
-    return sorted(starts, key=lambda start: start.cost)[:count]
+    starts = [(_start(*each, model, _SAMPLES), each) for each in best]
+    found = sorted(starts, key=lambda start: start[0].cost)[:count]
+    return [
+        replace(start, pose=model.sized(start.pose, _size(surface, body)))
+        for start, (surface, _, _, body) in found
+    ]
 
 
 def _mean_body(model: BodyModel, pose: BodyPose) -> Surface:
     return Surface(model.evaluate(pose)[0], model.triangles)
 
 
+def _size(surface: Surface, body: Surface) -> float:
+    return float(np.ptp(surface.vertices[:, 1]) / np.ptp(body.vertices[:, 1]))
+
+
 def _start(
     surface: Surface, frame: Frame, pose: BodyPose, body: Surface, model: BodyModel, samples: int
 ) -> Start:
     """Place the mean body by its box, scaled to the mesh's height, and measure both ways."""
-    size = np.ptp(surface.vertices[:, 1]) / np.ptp(body.vertices[:, 1])
+    size = _size(surface, body)
     middle = (body.vertices.max(0) + body.vertices.min(0)) / 2
     ids = model.skin[:: max(1, len(model.skin) // samples)]
     placed = size * (body.vertices[ids] - middle)

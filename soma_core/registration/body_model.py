@@ -25,6 +25,9 @@ _STIFF = {
 """Strength of the pull to the starting pose, by part of the joint's name; the rest has the strength below."""
 _SUPPLE = 0.1
 
+_PLAUSIBLE = 2e-4
+"""Distance [m] of all vertices that one standard deviation of a component is worth where a body is sized."""
+
 _ENDS = re.compile("Hand[A-Z]|Foot|Toe")
 """Joints of fingers and feet, which wait until limbs are in place."""
 
@@ -125,6 +128,20 @@ class BodyModel:
         place = 3 * np.searchsorted(self.joints, wrist)
         step[place : place + 3] = angle * normal / np.linalg.norm(normal)
         return self.moved_by(pose, step)
+
+    def sized(self, pose: BodyPose, size: float) -> BodyPose:
+        """A body `size` times as large in the same pose, as nearly as shapes go, its box about the origin.
+
+        A fit that begins with another stature takes the neck of a tall body for its head.
+        """
+        vertices, _ = self.evaluate(pose)
+        derivative = self.shape_derivative(pose)
+        rows = (derivative - derivative.mean(0)).reshape(-1, self.count)
+        wanted = (size - 1) * (vertices - vertices.mean(0)).ravel()
+        damped = rows.T @ rows + _PLAUSIBLE**2 * len(vertices) * np.eye(self.count)
+        larger = replace(pose, shape=pose.shape + np.linalg.solve(damped, rows.T @ wanted))
+        vertices, _ = self.evaluate(larger)
+        return larger.at(larger.hips - (vertices.max(0) + vertices.min(0)) / 2)
 
     @torch.no_grad()
     def evaluate(self, pose: BodyPose) -> tuple[np.ndarray, np.ndarray]:

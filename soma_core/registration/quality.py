@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from soma_core.paths import shipped_assets
-from soma_core.registration.coverage import Share, coverage, faults, matches
+from soma_core.registration.coverage import Share, coverage, faults, matches, slid
 from soma_core.registration.digits import digit_guide
 from soma_core.registration.folds import flipped_triangles
 from soma_core.registration.register import Registration
@@ -92,7 +92,7 @@ def measure(found: Registration, mesh: CanonicalMesh) -> Quality:
         coverage=covered,
         digits=matched,
         extremities=digits.counts,
-        faults=faults(covered, matched, digits.counts, told=found.told),
+        faults=faults(covered, matched, digits.counts, told=found.told) + slid(wrap, mesh, rig, found.filled),
     )
 
 

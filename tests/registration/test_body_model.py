@@ -12,6 +12,7 @@ from soma_core.registration.surface import Surface
 
 ORTHONORMAL = 1e-9
 STEP_MM = 0.05  # second order of a step of 0.01 rad on a lever of a metre
+SIZE = 0.02  # shapes are no similarities
 SIDES_MM = 1.5  # the rig's two sides are mirror images only to a millimetre
 SETTLED_MM = 5.0  # after the seven steps of the rough fit, from 140 mm away
 
@@ -42,6 +43,16 @@ def test_a_step_turns_what_hangs_on_the_joint(model: BodyModel) -> None:
     joint = model.joints[place]
     predicted = vertices + model.moved[:, joint, None] * np.cross(turn, vertices - joints[joint])
     assert 1000 * np.linalg.norm(moved - predicted, axis=1).max() < STEP_MM
+
+
+@pytest.mark.parametrize("size", [0.45, 1.0, 1.3])
+def test_a_sized_body_is_as_large_in_the_same_pose(model: BodyModel, size: float) -> None:
+    pose = model.start(1.4)
+    sized = model.sized(pose, size)
+    before, after = (model.evaluate(each)[0] for each in (pose, sized))
+    assert np.ptp(after[:, 1]) / np.ptp(before[:, 1]) == pytest.approx(size, abs=SIZE)
+    assert 1000 * np.abs(after.max(0) + after.min(0)).max() < STEP_MM
+    np.testing.assert_array_equal(sized.rotations, pose.rotations)
 
 
 def test_a_spun_hand_turns_in_its_wrist(model: BodyModel) -> None:

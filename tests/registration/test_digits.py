@@ -8,12 +8,23 @@ import numpy as np
 import pytest
 import trimesh
 
-from soma_core.registration.coverage import COVERED, MATCHED, Share, coverage, faults, matches, without_digits
+from soma_core.registration.coverage import (
+    COVERED,
+    MATCHED,
+    Share,
+    coverage,
+    faults,
+    matches,
+    slid,
+    without_digits,
+)
 from soma_core.registration.digits import LIMBS, digit_guide
 from soma_core.registration.surface import Surface
 from soma_core.rig import load_canonical
+from soma_core.rig.landmarks import canonical_landmarks
 
 TIP_M = 0.012  # a tip is the vertex furthest from the wrist, on a coarse mesh another one
+SLID_M = 0.04  # of a face, off a forehead that stays
 AWAY_M = 0.03  # what a rough fit may be off at wrists and insteps
 
 
@@ -100,6 +111,17 @@ def test_fingers_that_are_one_to_their_middle_are_no_fault(guide, halved) -> Non
     gone = {limb: np.clip(6 * along - 5, 0, None) for limb, along in found.along.items()}
     shares = matches(body, surface, replace(found, along=gone), guide)
     assert max(share.wrap for share in shares.values()) < MATCHED
+
+
+def test_a_face_that_slid_is_found_out(guide) -> None:
+    mesh, rig = load_canonical("mid")
+    filled = np.zeros(mesh.vertex_count, bool)
+    assert slid(7 * mesh.vertices, mesh, rig, filled) == ()
+    brow = mesh.vertices[canonical_landmarks()["LeftInnerEye"], 1] + 0.03
+    low = mesh.vertices.copy()
+    low[:, 1] -= SLID_M * np.clip((brow - low[:, 1]) / 0.02, 0, 1)
+    (said,) = slid(low, mesh, rig, filled)
+    assert said.startswith("head: ")
 
 
 @pytest.mark.parametrize(
