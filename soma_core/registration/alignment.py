@@ -26,6 +26,10 @@ _SAMPLES = 1200
 _SOFT = 0.08
 """Distance [m] at which a sample counts half."""
 
+_FAR = 1.3
+"""Factor of the mean body's height beyond which a fit may take the neck for the head, or end beside the body;
+nearer ones it reaches from the mean body, whose shape pulls least."""
+
 _AXES: tuple[Axis, ...] = ("+y", "+z", "-z", "+x", "-x", "-y")
 
 
@@ -64,14 +68,18 @@ def find_starts(
     best = [tried[index] for index in np.argsort(costs, kind="stable")[: max(_LEFT, count)]]
     starts = [(_start(*each, model, _SAMPLES), each) for each in best]
     found = sorted(starts, key=lambda start: start[0].cost)[:count]
-    return [
-        replace(start, pose=model.sized(start.pose, _size(surface, body)))
-        for start, (surface, _, _, body) in found
-    ]
+    return [_sized(start, _size(surface, body), model) for start, (surface, _, _, body) in found]
 
 
 def _mean_body(model: BodyModel, pose: BodyPose) -> Surface:
     return Surface(model.evaluate(pose)[0], model.triangles)
+
+
+def _sized(start: Start, size: float, model: BodyModel) -> Start:
+    """The same start with a body of the mesh's size, where the mean body is far from it."""
+    if 1 / _FAR < size < _FAR:
+        return start
+    return replace(start, pose=model.sized(start.pose, size))
 
 
 def _size(surface: Surface, body: Surface) -> float:
