@@ -66,9 +66,12 @@ def find_starts(
     tried = [(*each, *body) for each in zip(surfaces, frames, strict=True) for body in bodies]
     costs = [_start(*each, model, _ROUGHLY).cost for each in tried]
     best = [tried[index] for index in np.argsort(costs, kind="stable")[: max(_LEFT, count)]]
-    starts = [(_start(*each, model, _SAMPLES), each) for each in best]
+    starts = [
+        (_start(surface, frame, pose, body, model, _SAMPLES), _size(surface, body))
+        for surface, frame, pose, body in best
+    ]
     found = sorted(starts, key=lambda start: start[0].cost)[:count]
-    return [_sized(start, _size(surface, body), model) for start, (surface, _, _, body) in found]
+    return [_sized(start, size, model) for start, size in found]
 
 
 def _mean_body(model: BodyModel, pose: BodyPose) -> Surface:
