@@ -171,7 +171,9 @@ class TrainCorrectivesConfig:
     sparsity: float = 0.01
     patience: int = 8
     ridge: float = 1e-4
+    smoothness: float = 0.0
     mebibytes: float = 4.7
+    first: str | None = None
     save_every: int = 500
     resume: bool = True
     seed: int = 0

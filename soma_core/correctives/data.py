@@ -120,6 +120,12 @@ class LessonStore:
         part_of = clip.part_of or clip.name
         return Taught(name=clip.name, part_of=part_of, key=key, poses=len(clip.rotations))
 
+    def rotations(self, clip: Taught) -> np.ndarray:
+        """T-pose-relative rotations (n, J, 3, 3) of a lesson's poses."""
+        with np.load(self._path(clip.key), allow_pickle=False) as file:
+            found: np.ndarray = file["rotations"]
+        return found
+
     def read(self, clip: Taught, vertices: np.ndarray, *, mirrored: bool = False) -> Batch:
         """The lesson of a clip for some vertices; `mirrored` adds the mirror image of every pose.
 

@@ -12,6 +12,7 @@ import torch
 
 from soma_core.correctives.data import LessonStore, Taught
 from soma_core.correctives.features import local_bind_rotations
+from soma_core.correctives.limb_twist import slope_changes
 from soma_core.correctives.network import CorrectivesNetwork
 from soma_core.correctives.second_stage import accumulate, all_entries, pruned, to_matrix
 from soma_core.correctives.weights import CorrectiveWeights
@@ -60,6 +61,7 @@ def finished(
     rig: Rig,
     *,
     ridge: float,
+    smoothness: float,
     budget: int,
     mirror: bool,
     meta: Mapping[str, Any],
@@ -75,6 +77,7 @@ def finished(
         store, clips: what it was trained on.
         rig: of the mid LOD.
         ridge, budget: see :func:`second_stage.pruned`.
+        smoothness: weight of :func:`limb_twist.slope_changes` beside the squared error [rad^2].
         mirror: learn from mirror images as well.
         meta: what the checkpoint says about itself.
     """
@@ -85,9 +88,15 @@ def finished(
     lessons = (store.read(clip, np.arange(count), mirrored=mirror) for clip in clips)
     samples = ((everywhere.activations(lesson.features), _CM_PER_M * lesson.offsets) for lesson in lessons)
     normal = accumulate(samples, sizes, moved, network.channels)
+    gram = normal.gram
+    if smoothness:
+        copies = 2 if mirror else 1  # as many poses as the lessons
+        motions = (store.rotations(clip) for clip in clips)
+        bent = slope_changes(everywhere, rig, motions, np.random.default_rng(0))
+        gram = gram + smoothness * copies * bent
     strength = everywhere.strength.double().numpy()
     entries = all_entries(normal, moved.numpy(), sizes, strength, network.channels)
-    entries, values = pruned(normal.gram, entries, ridge=ridge, budget=budget)
+    entries, values = pruned(gram, entries, ridge=ridge, budget=budget)
     shape = (network.joint_count * network.channels, 3 * count)
     second = to_matrix(entries, values / _CM_PER_M, everywhere.joints, network.channels, shape)
     return CorrectiveWeights(

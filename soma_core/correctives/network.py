@@ -84,6 +84,15 @@ class CorrectivesNetwork(torch.nn.Module):
         """W2 with its mask multiplied in, (p, C, 3) [cm]."""
         return self.second * self.strength[:, None, None]
 
+    @torch.no_grad()
+    def take_first(self, matrix: scipy.sparse.csr_array) -> None:
+        """Set W1 to a matrix (6 J, J C) of the same masks and channels; see :meth:`first_matrix`."""
+        table, channels = self.reads.cpu().numpy(), self.channels
+        padded = np.pad(matrix.toarray(), ((0, 6), (0, 0)))  # absent joints read the zeros at the end
+        row = 6 * table[:, :, None, None] + np.arange(6)[:, None]
+        column = channels * self.joints[:, None, None, None] + np.arange(channels)
+        self.first.copy_(torch.as_tensor(padded[row, column]).view_as(self.first))
+
     def first_matrix(self) -> scipy.sparse.csr_array:
         """W1 as a matrix (6 J, J C), without the rows that see zeros."""
         table, values = self.reads.cpu().numpy(), self.first.detach().cpu().double().numpy()

@@ -18,12 +18,12 @@ from soma_core.cache import atomic_write, content_key
 from soma_core.correctives.data import ClipPlan, LessonStore, Split, Taught, split_clips
 from soma_core.correctives.finish import Masks, entry_budget, finished
 from soma_core.correctives.masks import find_creases, joint_mask, vertex_mask
-from soma_core.correctives.model import Correctives
+from soma_core.correctives.model import Correctives, find_correctives
 from soma_core.correctives.network import CorrectivesNetwork
 from soma_core.correctives.plot import plot_history
 from soma_core.correctives.processes import Processes, joined_processes
 from soma_core.correctives.teacher import Clip, ElasticTeacher, Teacher
-from soma_core.correctives.training import Trainer, TrainingOptions, reduction
+from soma_core.correctives.training import Epoch, Trainer, TrainingOptions, reduction
 from soma_core.correctives.weights import CorrectiveWeights, read_weights, write_weights
 from soma_core.errors import InputError
 from soma_core.io import read_motion
@@ -59,6 +59,10 @@ def run(config: DictConfig, output: Path) -> None:
         BackendError: the teacher's backend is not usable.
     """
     _check(config.data)
+    if not config.smoothness >= 0:
+        raise InputError(
+            "smoothness", got=config.smoothness, expected="at least 0", fix="Leave folds with smoothness=0."
+        )
     mesh, rig = load_canonical("mid")
     options = TrainingOptions(mirror=config.data.mirror, **{name: config[name] for name in _OPTIONS})
     masks = _masks(mesh, rig, config.reach)
@@ -68,20 +72,24 @@ def run(config: DictConfig, output: Path) -> None:
         store = LessonStore(cache_dir() / "train_correctives" / "lessons", teacher, mesh, rig)
         taught = _taught(store, config, rig, processes)
         clips = split_clips(taught, held_out=config.data.held_out, seed=config.seed)
-        trainer, network = _trained(config, options, masks, store, clips, processes)
+        history: list[Epoch] = []
+        if config.first:
+            network = _kept_first(config, masks)
+        else:
+            history, network = _trained(config, options, masks, store, clips, processes)
         if processes.rank > 0:
             return
         meta = _provenance(config, teacher, clips, mesh)
         weights = finished(
-            network, masks, store, clips["train"], rig, ridge=options.ridge, budget=budget,
-            mirror=options.mirror, meta={**meta, "epochs": len(trainer.history)},
+            network, masks, store, clips["train"], rig, ridge=options.ridge, smoothness=config.smoothness,
+            budget=budget, mirror=options.mirror, meta={**meta, "epochs": len(history)},
         )  # fmt: skip
         path = Path(config.out) if config.out else output / CORRECTIVES_NAME
         write_weights(path, weights)
         measured = _tested(read_weights(path), store, clips["test"], mesh, rig)
-        _report(output, {**meta, **measured, "bytes": path.stat().st_size, "history": trainer.history})
+        _report(output, {**meta, **measured, "bytes": path.stat().st_size, "history": history})
         _log.info("error to the teacher on held-out clips reduced by %.1f %%", 100 * measured["reduction"])
-        if not plot_history(trainer.history, output / "loss.png"):
+        if history and not plot_history(history, output / "loss.png"):
             _log.info("matplotlib is not installed: report.json has the numbers, there is no plot")
 
 
@@ -190,7 +198,7 @@ def _trained(
     store: LessonStore,
     clips: Mapping[Split, Sequence[Taught]],
     processes: Processes,
-) -> tuple[Trainer, CorrectivesNetwork]:
+) -> tuple[list[Epoch], CorrectivesNetwork]:
     """Train both stages on the vertices of ``config.lod``."""
     vertices = _training_vertices(config)
     network = CorrectivesNetwork(
@@ -209,7 +217,32 @@ def _trained(
         resume=config.resume,
         progress=lambda steps, done: progress(steps, label="epoch", total=options.epochs, done=done),
     )
-    return trainer, network
+    return trainer.history, network
+
+
+def _kept_first(config: DictConfig, masks: Masks) -> CorrectivesNetwork:
+    """The first stage of a checkpoint on the vertices of the mid LOD; the second is yet to be solved.
+
+    Raises:
+        InputError: another number of joints or channels.
+    """
+    path = find_correctives(config.first, shipped=True)
+    if path is None:
+        raise InputError(
+            "first", got=config.first, expected="a checkpoint", fix="Name its file, or leave it out."
+        )
+    first = read_weights(path).first
+    network = CorrectivesNetwork(masks.joints, masks.vertices, channels=config.channels, seed=config.seed)
+    wanted = network.first_matrix().shape
+    if first.shape != wanted:
+        raise InputError(
+            "first",
+            got=f"{path}, whose first stage is {first.shape}",
+            expected=f"{wanted}: 6 numbers of each joint by {config.channels} activations of each",
+            fix="Set channels as that checkpoint has them, or leave first out.",
+        )
+    network.take_first(first)
+    return network
 
 
 def _training_vertices(config: DictConfig) -> np.ndarray:
@@ -232,7 +265,8 @@ def _tested(
 def _provenance(
     config: DictConfig, teacher: Teacher, clips: Mapping[Split, Sequence[Taught]], mesh: CanonicalMesh
 ) -> dict[str, Any]:
-    settings = {name: config[name] for name in (*_OPTIONS, "channels", "reach", "mebibytes")}
+    names = (*_OPTIONS, "channels", "reach", "mebibytes", "first", "smoothness")
+    settings = {name: config[name] for name in names}
     return {
         **teacher.provenance,
         "rig_revision": mesh.revision,

@@ -100,8 +100,9 @@ def test_a_finished_model_is_the_teacher_where_it_can_be(body, teacher, tmp_path
         for index in range(2)
     ]
     weights = finished(
-        teacher.network, body.masks, Store(), clips, body.rig, ridge=1e-9, budget=10**6, mirror=False, meta={}
-    )
+        teacher.network, body.masks, Store(), clips, body.rig, ridge=1e-9, smoothness=0.2, budget=10**6,
+        mirror=False, meta={},
+    )  # fmt: skip
     write_weights(tmp_path / "model.pt", weights)
     stored = read_weights(tmp_path / "model.pt")
     model = Correctives(stored, body.rig, offset_rows(body.mesh), dtype=torch.float32, device="cpu")

@@ -77,6 +77,7 @@ def test_the_same_configuration_gives_the_same_model(config, tmp_path):
         ("data.random_clips", 1, r"data: got 1 clips, expected at least 3"),
         ("mebibytes", 0.01, r"mebibytes: got 0\.01"),
         ("batch", 10**6, r"batch: got 1000000"),
+        ("smoothness", -0.1, r"smoothness: got -0\.1, expected at least 0"),
     ],
 )
 def test_what_cannot_be_is_named(config, tmp_path, key, value, text):
@@ -175,3 +176,16 @@ def test_the_teacher_is_chosen_by_one_word():
     assert train_correctives.make_teacher("elastic", mesh, rig).name == "elastic"
     with pytest.raises(InputError, match="teacher: got soma, whose generator offers no posed meshes"):
         train_correctives.make_teacher("soma", mesh, rig)
+
+
+def test_a_kept_first_stage_leaves_the_second_to_be_solved(config, tmp_path):
+    train_correctives.run(config, tmp_path / "one")
+    config.first = str(tmp_path / "one" / "correctives_model.pt")
+    train_correctives.run(config, tmp_path / "two")
+    one, two = (read_weights(tmp_path / name / "correctives_model.pt") for name in ("one", "two"))
+    assert (one.first != two.first).nnz == 0
+    assert abs(one.second - two.second).max() < 1e-6  # metres: the same lessons, in closed form both times
+    assert two.meta["epochs"] == 0
+    config.channels = CHANNELS + 1
+    with pytest.raises(InputError, match="first: got .*Set channels"):
+        train_correctives.run(config, tmp_path / "three")
