@@ -108,6 +108,7 @@ def test_lessons_are_taught_once(store, teacher, clips):
     np.testing.assert_allclose(batch.offsets, wanted.offsets[:, ids], rtol=HALF, atol=1e-6)
     features = teacher.features(torch.as_tensor(clips[0].rotations).float())
     torch.testing.assert_close(batch.features, features)
+    np.testing.assert_allclose(store.rotations(kept), clips[0].rotations, atol=1e-6)  # float32
 
 
 def test_mirrored_lessons_are_those_of_the_partners(store, body, clips):
