@@ -55,7 +55,7 @@ class NativeFit(Derived):
     once, hands included.
 
     Args:
-        backend: name of an installed backend whose generator tells its skinning (the SMPL family).
+        backend: name of an installed backend whose generator tells its skinning (Anny, the SMPL family).
         options: the backend's own options, such as a gender.
         lod: of the canonical vertices that come in.
         iterations: largest number of steps under the whole model.
@@ -107,7 +107,7 @@ class NativeFit(Derived):
             raise InputError(
                 "backend",
                 got=f"{backend}, whose generator has no skinning()",
-                expected="a backend that tells its skinning, such as smpl, smplh or smplx",
+                expected="a backend that tells its skinning, such as anny, smpl or smplx",
                 fix="NativeTransfer gives its vertices.",
             )
         self._generator, self._isolated = generator, lambda: registry.isolated(backend, "rest")
