@@ -317,9 +317,11 @@ def _unposed(bodies: Sequence[Tensor], config: DictConfig) -> Tensor:
 
 def _shown(space: LinearSpace, name: str, errors: np.ndarray, fitted: Tensor) -> ShownBody:
     """The projection of the first body, coloured by what it lacks."""
+    vertices = fitted[0].cpu().numpy()
+    vertices = vertices - [0.0, vertices[:, 1].min(), 0.0]  # bodies of any height, on one floor
     colours = np.full(len(space.kept), np.nan)
     colours[space.kept.cpu().numpy()] = errors[0]
     return ShownBody(
         caption=f"{space.name}, {name}\nmean {errors[0].mean():.3g} mm",
-        vertices=fitted[0].cpu().numpy(), triangles=space.layer.mesh.triangles, errors_mm=colours,
+        vertices=vertices, triangles=space.layer.mesh.triangles, errors_mm=colours,
     )  # fmt: skip

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import json
 import os
 import shutil
@@ -17,6 +18,8 @@ import numpy as np
 import pytest
 
 from soma_core.motion.clips import clip_schema, write_rows
+from soma_core.obj import write_obj
+from soma_core.rig import load_canonical
 
 pytestmark = [
     pytest.mark.slow,
@@ -148,3 +151,31 @@ def test_train_correctives(tmp_path, shards, count):
     killed(command, cut, lambda: list(cache.glob("[!.]*.pt")), count)
     assert "going on after epoch" in finished(command, cut, count)
     equal_files(whole / "run", cut / "run", ["correctives_model.pt", "report.json"])
+
+
+def test_wrap(tmp_path):
+    whole, cut = homes(tmp_path)
+    mesh = load_canonical("low")[0]
+    write_obj(tmp_path / "body.obj", 1.1 * mesh.vertices, mesh.triangles)
+    command = (*SOMA, "wrap", f"native={tmp_path / 'body.obj'}", "unit=m", "picture=false", "out=made")
+    finished(command, whole)
+    killed(command, cut, lambda: list((cut / "made").glob("body.obj")))
+    finished(command, cut)
+    equal_files(whole / "made", cut / "made", ["SOMA_wrap.obj", "body.obj", "report.json"])
+
+
+@pytest.mark.skipif(importlib.util.find_spec("anny") is None, reason="anny is not installed")
+def test_assets(tmp_path):
+    whole, cut = homes(tmp_path)
+    command = (sys.executable, "-m", "assets.make", "--output", "assets")
+    finished(command, whole)
+    for file in ("SOMA_template_rig.usda", "SOMA_neutral.npz"):
+        killed(command, cut, (cut / "assets" / file).exists)
+    finished(command, cut)
+    names = [
+        path.relative_to(whole / "assets").as_posix()
+        for path in (whole / "assets").rglob("*")
+        if path.is_file()
+    ]
+    assert len(names) >= 5
+    equal_files(whole / "assets", cut / "assets", names)
