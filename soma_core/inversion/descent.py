@@ -54,20 +54,20 @@ def descended(
     damping = torch.full_like(mass, rule.damping)
     clip = None if bound is None or typical is None else torch.stack((bound, typical))
     pose = out = replace(start, last_change=torch.full_like(mass, torch.inf))
-    rows, begin, end = torch.arange(len(mass)), 0, min(at_once, iterations)
+    rows, begin, end, going = torch.arange(len(mass)), 0, min(at_once, iterations), False
     whole = mass.new_empty(len(mass), model.steps.under_way)
     doubt, known = problem.doubt, None
     if doubt is not None:
         known = model.solver.columns(doubt.variable), doubt.axis.contiguous(), doubt.square
     while True:
-        # Frames that go on get a matrix anyway; where one step is the last of most, its own one judges it.
-        made = tuple(step for step in range(begin, end + (at_once == 1)) if renewed(step))
+        # The first one always is; where few go on after one step, its own matrix judges it.
+        made = tuple(step for step in range(begin, end + (end == 1)) if renewed(step))
         frames = len(rows)
         found = descend(
             model.steps, model.constants(problem.rest), model.residual.tables, rule, known,
             problem.identity.rest, problem.weights, pose.relative, pose.translation, damping,
             problem.weights.sum(1).expand(frames), model.scale(problem).expand(frames), problem.vertices,
-            problem.origin, clip, state, begin=begin, end=end, renewed=made,
+            problem.origin, clip, state, begin=begin, end=end, going=going, renewed=made,
         )  # fmt: skip
         pose = Pose(
             relative=found.relative, translation=found.hips, last_change=found.change,
@@ -82,7 +82,7 @@ def descended(
             rows, problem, pose = rows[still], problem.part(still), pose.part(still)
             clip = None if clip is None else clip[:, still]
         damping, state = found.damping[still], found.state[still]
-        begin, end = end, min(end + _AT_ONCE, iterations)
+        begin, end, going = end, min(end + _AT_ONCE if end else 1, iterations), True
 
 
 def converted(state: Tensor, factor: Tensor) -> Tensor:

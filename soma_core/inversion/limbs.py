@@ -13,6 +13,7 @@ import functools
 import math
 from collections.abc import Collection
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -27,6 +28,10 @@ from soma_core.inversion.offsets import PoseOffsets
 from soma_core.inversion.priors import TwistDoubt
 from soma_core.inversion.problem import Pose, Problem, View
 from soma_core.rig.skeleton import Rig
+
+if TYPE_CHECKING:
+    from soma_core.kernels.pose_solver_wp import PoseSolver
+    from soma_core.kernels.twist_share_wp import LimbTables
 
 __all__ = ["Limb", "LimbStart", "TwistShare"]
 
@@ -172,6 +177,7 @@ class TwistShare:
     ) -> None:
         assert rig.procedural is not None
         self.driven, self.offsets = driven, offsets
+        self._tables: LimbTables | None = None  # made when first asked for
         names = (*rig.joint_names, *rig.procedural.joint_names)
         channel, row = driven.joint.tolist(), {int(joint): index for index, joint in enumerate(joints)}
         device = driven.mix.device
@@ -206,6 +212,8 @@ class TwistShare:
         held: Collection[int] = (),
         *,
         near: bool = False,
+        steps: PoseSolver | None = None,
+        constants: tuple[Tensor, bool] | None = None,
     ) -> Pose:
         """The pose with the best share of every limb, as far as moments tell.
 
@@ -216,12 +224,16 @@ class TwistShare:
             variables: (n,) joints that may turn.
             held: joints that cannot turn so; limbs with such stay as they are.
             near: look only about what the pose has.
+            steps, constants: kernels of the model, and what they take of the identities; None without.
         """
         rest, doubt = problem.rest, problem.doubt
-        relative = pose.relative.clone()
-        angle = torch.linspace(-math.pi, math.pi, _SHARES).to(relative)
+        angle = torch.linspace(-math.pi, math.pi, _SHARES).to(pose.relative)
         if near:
             angle = angle[(_SHARES - _SHARES_NEAR) // 2 :][:_SHARES_NEAR]
+        if steps is not None and constants is not None and view.activity is not None:
+            doubts = self._limb_doubts(doubt, variables)
+            return self._by_warp(pose, view, rest, scale, angle, doubts, held, steps, constants)
+        relative = pose.relative.clone()
         for limb in self.free(held):
             energy = self._skin(limb, angle, view, rest) + self._moves(
                 limb, angle, pose.relative, view, scale
@@ -231,6 +243,41 @@ class TwistShare:
                 energy = energy + view.energy[:, None] * change
             self.turn(relative, limb, _lowest(angle, energy))
         return replace(pose, relative=relative)
+
+    def _by_warp(
+        self, pose: Pose, view: View, rest: RestMoments, scale: Tensor, angle: Tensor, doubts: Tensor,
+        held: Collection[int], steps: PoseSolver, constants: tuple[Tensor, bool],
+    ) -> Pose:  # fmt: skip
+        from soma_core.kernels.twist_share_wp import limb_tables, shared_twists
+
+        offsets, driven, activity = self.offsets, self.driven, view.activity
+        assert activity is not None
+        assert activity.before is not None
+        assert view.pull is not None
+        assert view.residual is not None
+        if self._tables is None:
+            features = offsets.left, offsets.right[..., : offsets.columns]
+            room = steps.counts["response_size"]
+            self._tables = limb_tables(self.limbs, driven.mix, driven.public_count, features, room, _SHARES)
+        free = self.free(held)
+        mass = rest.own[..., 3, 3].sum(1).expand(len(scale))
+        frames = (pose.relative, pose.translation, view.residual, activity.before, view.pull, view.energy,
+                  scale, mass)  # fmt: skip
+        relative = shared_twists(
+            steps, constants, self._tables, angle, doubts,
+            sum(1 << place for place, limb in enumerate(self.limbs) if limb not in free), frames,
+            dear=_DEAR, least=_CLEAR,
+        )  # fmt: skip
+        return replace(pose, relative=relative)
+
+    def _limb_doubts(self, doubt: TwistDoubt | None, variables: Tensor) -> Tensor:
+        """Axis and square (L, 4) of the doubt of each limb's next joint."""
+        doubts = variables.new_zeros(len(self.limbs), 4, dtype=self.driven.mix.dtype)
+        if doubt is not None:
+            ends = variables.new_tensor([limb.end for limb in self.limbs])
+            limb, which = torch.nonzero(variables[doubt.variable] == ends[:, None], as_tuple=True)
+            doubts[limb] = torch.cat((doubt.axis, doubt.square[:, None]), 1)[which]
+        return doubts
 
     def free(self, held: Collection[int]) -> list[Limb]:
         """Limbs neither of whose joints is held."""

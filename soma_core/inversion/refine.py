@@ -221,6 +221,7 @@ class Refinement:
         """The same of some frames, where their doubt of twists is settled."""
         bound, typical = (None if one is None else one[rows] for one in (self.bound, self.typical))
         few = Refinement(self.model, self.problem.part(rows), bound, typical)
+        few.state = None if self.state is None else self.state[rows]
         if self.weight is not None and few.problem.doubt is not None:
             few.weight = self.weight[rows]
             few.doubt = few.problem.doubt.weighed(few.weight)

@@ -307,7 +307,8 @@ class SkinModel(torch.nn.Module):
         mass = (problem.weights.sum(1) / typical).expand(len(pose.translation))
         if self.offsets is None:
             return self._variance(problem, pose, None, mass) / typical[:, None]
-        activity = self.offsets.activity(pose.relative)
+        _, _, activity, _ = self._posed(problem, pose)
+        assert activity is not None
         found = self._variance(problem, pose, activity, mass)
         if not bool(found.isfinite().all()):
             still = replace(activity, slope=torch.zeros_like(activity.value))

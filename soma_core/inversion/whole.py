@@ -30,8 +30,8 @@ _RESTING, _RESTING_SHARE, _COARSE_SHARE = 1.5e-7, 1e-2, 2e-2
 """A frame rests where a Newton step would change it by less, as a root mean square of its vertices [m], or
 relative to the error that is left; the last on the way, on few vertices, whose minimum is another."""
 
-_AT_ONCE = (5, 1)
-"""Steps that all frames take together: on the way, and at the end, where many rest at once."""
+_AT_ONCE = (5, 0)
+"""Steps that all frames take together: on the way, and at the end, where most rest before the first."""
 
 _SAMPLED = 8
 """Every so many vertices have a say in a frame's median residual."""
@@ -58,9 +58,14 @@ _TRIED, _FAR = ((0.2, -0.2), (0.45, -0.45)), (0.8, -0.8, 1.6, -1.6, 2.4, -2.4, 3
 one limb after the other, for what lies on few of the vertices."""
 
 
-_FEW, _THEIRS, _AGAIN = 0.25, 0.25, 2
+_FEW, _THEIRS, _AGAIN, _ANOTHER = 0.25, 0.25, 2, 0.3
 """A limb may be what is wrong where median over root mean square error is less, and more of the error than
-this share lies on the limb's skin; how often that is looked at."""
+this share lies on the limb's skin; how often that is looked at. Not where :func:`clumping` is more than the
+last and plain skinning is fitted too: 0.14 to 0.2 where a limb stopped in a wrong place, and see above."""
+
+_AT_FIRST, _BEST, _HOPELESS, _ARRIVING = 5, 2, (3.0, 1e-4), 0.1
+"""Steps from every start of a limb, and how many starts of a frame go on after them: none whose error is that
+many times what was found before and above a length [m], and one alone where its error is that share of it."""
 
 
 class _Clip(NamedTuple):
@@ -141,6 +146,15 @@ def is_worse(second: Tensor, first: Tensor, weights: Tensor, robust: float) -> T
     bound = _WRONG * _clip(first, weights, robust).bound[:, None]
     after, before = ((weights * torch.minimum(one, bound).square()).nansum(1) for one in (second, first))
     return after > 1.1 * before + weights.sum(1) * _DOUBTFUL[0] ** 2
+
+
+def _promising(found: Tensor, before: Tensor) -> Tensor:
+    """Which starts of frames (s, F) go on, by mean square errors after some steps and the frames' before."""
+    least = found.min(0).values
+    rank = found.argsort(dim=0, stable=True).argsort(dim=0)
+    most = torch.where(least < _ARRIVING**2 * before, 1, _BEST)
+    times, length = _HOPELESS
+    return (rank < most) & (found < (times**2 * before).clamp_min(length**2))
 
 
 class WholeFit:
@@ -229,7 +243,13 @@ class WholeFit:
         view = replace(view, energy=weight * (view.energy if clip is None else mass * clip.typical.square()))
         scale = self.coarse.scale(problem).expand(len(pose.translation))
         n = self.coarse.solver.variables
-        return share(pose, view, problem, scale, n, self._held(problem), near=near)
+        steps, constants = self.coarse.steps, None
+        if steps is None or pose.relative.is_cuda:
+            return share(pose, view, problem, scale, n, self._held(problem), near=near)
+        constants = self.coarse.constants(problem.rest)
+        return share(
+            pose, view, problem, scale, n, self._held(problem), near=near, steps=steps, constants=constants
+        )
 
     def _kept(self, problem: Problem, pose: Pose) -> JointTerms | None:
         """Terms that keep the share of a limb's twist, which moments do not tell."""
@@ -269,16 +289,16 @@ class WholeFit:
 
     def _descended(
         self, model: PoseModel, problem: Problem, pose: Pose, clip: _Clip | None,
-        before: Refinement | None = None,
+        before: Refinement | None = None, steps: int | None = None,
     ) -> tuple[Pose, Refinement]:  # fmt: skip
-        """Descent on the model, which goes on with what one `before` remembers."""
-        clips = () if clip is None else clip
+        """Descent on the model, which goes on with what one `before` remembers; of few steps if given."""
+        clips, most = () if clip is None else clip, self.options.refreshes if steps is None else steps
         share = _RESTING_SHARE if model is self.model else _COARSE_SHARE
         refinement = Refinement(model, problem, *clips)
         if before is not None:
             refinement.remember(before)
         pose = refinement(
-            pose, iterations=self.options.refreshes, tolerance=_RESTING, share=share,
+            pose, iterations=most, tolerance=_RESTING, share=share,
             at_once=_AT_ONCE[model is not self.coarse],
         )  # fmt: skip
         return pose, refinement
@@ -296,8 +316,10 @@ class WholeFit:
         for tried in _TRIED:
             pose, energy = self._tried(problem, pose, energy, rows, [(limbs, angle) for angle in tried])
             rows = rows[(energy[rows] / mass[rows]).sqrt() > _DOUBTFUL[0]]
-        for _ in range(_AGAIN):
-            for limb, stray in self._stray(problem, pose, limbs, (energy / mass).sqrt()):
+        looked = torch.full_like(energy, torch.inf)
+        for _ in range(_AGAIN):  # a frame that nothing helped would be tried from the same places again
+            error, looked = (energy / mass).sqrt().where(energy < looked, 0.0), energy
+            for limb, stray in self._stray(problem, pose, limbs, error):
                 far = [([limb], angle) for angle in _FAR]
                 pose, energy = self._tried(problem, pose, energy, stray, far)
         return pose
@@ -316,6 +338,10 @@ class WholeFit:
         few = median_distance(distances, part.weights) < _FEW * error[rows]
         energy = torch.where(part.weights > 0, part.weights * distances.square(), 0.0)
         theirs = energy @ self.skin > _THEIRS * energy.sum(1, keepdim=True)
+        if self.options.skinning == "auto" and bool(few.any()):
+            view = self.coarse.view(part, pose.part(rows))
+            pieces = clumping(self.coarse, view, part.weights.sum(1).expand(len(rows)))
+            few = few & ~((pieces > _ANOTHER) & (error[rows] > _DOUBTFUL[1]))
         assert self.coarse.share is not None
         places = [self.coarse.share.limbs.index(limb) for limb in limbs]
         return [(limb, rows[few & theirs[:, place]]) for limb, place in zip(limbs, places, strict=True)]
@@ -336,9 +362,23 @@ class WholeFit:
             own = relative[number * len(rows) : (number + 1) * len(rows)]
             for limb in limbs:
                 self.coarse.share.turn(own, limb, own.new_full((len(rows),), angle))
-        trial, _ = self._descended(self.coarse, part, replace(old, relative=relative), None)
-        _, reached = self.coarse.distances(part, trial, energy_only=True)
-        least, which = reached.view(len(starts), -1).min(0)
+        trial = replace(old, relative=relative)
+        trial, way = self._descended(self.coarse, part, trial, None, steps=_AT_FIRST)
+        _, found = self.coarse.distances(part, trial, energy_only=True)
+        mass = problem.weights.sum(1).expand(len(energy))[rows]
+        promising = _promising(found.view(len(starts), -1) / mass, energy[rows] / mass)
+        going = torch.nonzero(promising.flatten()).flatten()
+        if not len(going):
+            return pose, energy
+        going = problem.several(going)
+        part = part.part(going)
+        arrived, _ = self._descended(self.coarse, part, trial.part(going), None, way.part(going))
+        _, reached = self.coarse.distances(part, arrived, energy_only=True)
+        least, which = (
+            torch.full_like(found, torch.inf).index_copy(0, going, reached).view_as(promising).min(0)
+        )
         better = least < 0.9 * energy[rows]
-        chosen = trial.part((which * len(rows) + torch.arange(len(rows)).to(which))[better])
+        chosen = trial.put(going, arrived).part(
+            (which * len(rows) + torch.arange(len(rows)).to(which))[better]
+        )
         return pose.put(rows[better], chosen), energy.index_copy(0, rows[better], least[better])

@@ -13,9 +13,10 @@ from soma_core.kernels import _solver_text as text
 from soma_core.kernels import _variance_text as variance
 from soma_core.kernels import _view_text as view
 from soma_core.kernels._native import native
+from soma_core.kernels._share_text import SHARE
 from soma_core.kernels._solver_layout import COUNTS, KEPT, LISTS, NUMBERS, SLOTS
 
-__all__ = ["Task", "descent_functions", "of_identities", "solver_functions"]
+__all__ = ["Task", "descent_functions", "of_identities", "share_function", "solver_functions"]
 
 _ids, _Made = wp.array(dtype=wp.int32), TypeVar("_Made")
 
@@ -152,6 +153,20 @@ def descent_functions(scalar: str, lanes: int, *, shared: bool) -> SimpleNamespa
     }  # fmt: skip
     bare = {"taken": descent.TAKEN, "drawn": descent.DRAWN}
     return _made({**bodies, **_bare(bare, real)}, scalar, lanes, shared=shared)
+
+
+@of_identities
+def share_function(scalar: str, lanes: int, *, shared: bool) -> wp.Function:
+    """Searches how limbs share their twist."""
+    real = wp.array(dtype=getattr(wp, scalar))
+    number = getattr(wp, scalar)
+
+    def share(
+        plan: _ids, numbers: real, k: real, s: real, f: real, limbs: _ids, values: real, angles: real,
+        doubts: real, count: int, held: int, dear: number, clear_least: number,
+    ): ...  # fmt: skip
+
+    return _made({"share": (SHARE, share)}, scalar, lanes, shared=shared).share
 
 
 @wp.struct

@@ -8,7 +8,8 @@ GPU one body serves both.
 import re
 from collections.abc import Sequence
 
-__all__ = ["ACCEPT", "BEGIN", "CHANGE", "FORCES", "MOVE", "SOLVE", "STILL", "TERMS", "WALK", "prelude"]
+__all__ = ["ACCEPT", "BEGIN", "CHANGE", "FORCES", "MOVE", "QUATERNION", "SOLVE", "STILL", "TERMS", "WALK",
+           "prelude"]  # fmt: skip
 
 
 def prelude(
@@ -71,7 +72,33 @@ STILL = """
     damping[0] = zero + damping_start; moving[0] = one; accepted[0] = zero; soft_energy[0] = zero;
 """
 
-WALK = """
+QUATERNION = """
+    auto quaternion_of = [&](const V* x, V* q) {
+        for (int n = 0; n < N; n++) {
+            R y[9]; for (int i = 0; i < 9; i++) y[i] = ((const R*)(x + i))[n];
+            R t0 = 1 + y[0] + y[4] + y[8], t1 = 1 + y[0] - y[4] - y[8];
+            R t2 = 1 + y[4] - y[0] - y[8], t3 = 1 + y[8] - y[0] - y[4];
+            R p[4];
+            if (t0 >= t1 && t0 >= t2 && t0 >= t3) {
+                p[0] = t0; p[1] = y[7] - y[5]; p[2] = y[2] - y[6]; p[3] = y[3] - y[1];
+            } else if (t1 >= t2 && t1 >= t3) {
+                p[0] = y[7] - y[5]; p[1] = t1; p[2] = y[1] + y[3]; p[3] = y[2] + y[6];
+            } else if (t2 >= t3) {
+                p[0] = y[2] - y[6]; p[1] = y[1] + y[3]; p[2] = t2; p[3] = y[5] + y[7];
+            } else {
+                p[0] = y[3] - y[1]; p[1] = y[2] + y[6]; p[2] = y[5] + y[7]; p[3] = t3;
+            }
+            R f = 1 / wp::sqrt(p[0]*p[0] + p[1]*p[1] + p[2]*p[2] + p[3]*p[3]);
+            if (p[0] < 0) f = -f;
+            for (int i = 0; i < 4; i++) ((R*)(q + i))[n] = f*p[i];
+        }
+    };
+"""
+"""Quaternion w, x, y, z of a rotation, with w >= 0."""
+
+WALK = (
+    QUATERNION
+    + """
     M rel = trial ? trial_relative : relative; M tr = trial ? trial_turns : turns;
     M pl = trial ? trial_places : places; M hp = trial ? trial_hips : hips;
     M st = trial ? trial_steer : steer;
@@ -87,25 +114,8 @@ WALK = """
                     m[3*r+q] = l[r] * x[q] + l[3+r] * x[3+q] + l[6+r] * x[6+q];
                 for (int r = 0; r < 3; r++) for (int q = 0; q < 3; q++)
                     x[3*r+q] = m[3*r] * d[q] + m[3*r+1] * d[3+q] + m[3*r+2] * d[6+q];
-                V w, u, v, z;
-                for (int n = 0; n < N; n++) {
-                    R y[9]; for (int i = 0; i < 9; i++) y[i] = ((const R*)(x + i))[n];
-                    R t0 = 1 + y[0] + y[4] + y[8], t1 = 1 + y[0] - y[4] - y[8];
-                    R t2 = 1 + y[4] - y[0] - y[8], t3 = 1 + y[8] - y[0] - y[4];
-                    R p[4];
-                    if (t0 >= t1 && t0 >= t2 && t0 >= t3) {
-                        p[0] = t0; p[1] = y[7] - y[5]; p[2] = y[2] - y[6]; p[3] = y[3] - y[1];
-                    } else if (t1 >= t2 && t1 >= t3) {
-                        p[0] = y[7] - y[5]; p[1] = t1; p[2] = y[1] + y[3]; p[3] = y[2] + y[6];
-                    } else if (t2 >= t3) {
-                        p[0] = y[2] - y[6]; p[1] = y[1] + y[3]; p[2] = t2; p[3] = y[5] + y[7];
-                    } else {
-                        p[0] = y[3] - y[1]; p[1] = y[2] + y[6]; p[2] = y[5] + y[7]; p[3] = t3;
-                    }
-                    R f = 1 / wp::sqrt(p[0]*p[0] + p[1]*p[1] + p[2]*p[2] + p[3]*p[3]);
-                    if (p[0] < 0) f = -f;
-                    ((R*)&w)[n] = f*p[0]; ((R*)&u)[n] = f*p[1]; ((R*)&v)[n] = f*p[2]; ((R*)&z)[n] = f*p[3];
-                }
+                V q_[4]; quaternion_of(x, q_);
+                V w = q_[0], u = q_[1], v = q_[2], z = q_[3];
                 V along = e[0] * u + e[1] * v + e[2] * z; V more = one + w;
                 V f = R(2) / (more * more + along * along);
                 V g0 = f * (more * (e[0] * w + e[2] * v - e[1] * z) + along * u);
@@ -141,6 +151,7 @@ WALK = """
         }
     }
 """
+)
 
 CHANGE = """
     for (int t = 0; t < weighted_count; t++) {

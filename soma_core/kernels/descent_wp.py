@@ -282,7 +282,7 @@ def descend(
     solver: PoseSolver, constants: tuple[Tensor, bool], tables: Mapping[str, Tensor], rule: DescentRule,
     doubt: tuple[Tensor, Tensor, Tensor] | None, rest: Tensor, weights: Tensor, relative: Tensor,
     hips: Tensor, damping: Tensor, mass: Tensor, scale: Tensor, targets: Tensor, origin: Tensor,
-    clip: Tensor | None, state: Tensor | None, *, begin: int, end: int, renewed: Sequence[int],
+    clip: Tensor | None, state: Tensor | None, *, begin: int, end: int, going: bool, renewed: Sequence[int],
 ) -> Descended:  # fmt: skip
     """Lower the error of F frames.
 
@@ -297,9 +297,9 @@ def descend(
         targets, origin: (F, v, 3) and (F, 3) [m].
         clip: lengths beyond which residuals count linearly, and typical ones (2, F) [m]; None for least
             squares.
-        state: of an earlier descent of these frames, which this one goes on with; where it begins anew, only
-            its memory of steps counts. None without.
+        state: of an earlier descent of these frames; None without.
         begin, end: steps that are taken, counted from the first look.
+        going: whether this goes on with that one; where it begins anew, only the memory of steps counts.
         renewed: those at which the matrix is made, beside the first.
     """
     count, vertices = targets.shape[:2]
@@ -327,7 +327,7 @@ def descend(
     sizes = 12 * joints, activations, 12 * joints, activations, tile_slots().size, len(base)
     kernel = _kernel(scalar, lanes, shared=constants[1])
 
-    again = (0 if state is None else 1) if begin == 0 else 2
+    again = 2 if going else int(state is not None)
     task, seen = Task(), Compared()
     task.frames, task.iterations, task.forced, task.outcome = count, end - begin, int(again < 2), again
     task.soft_count, task.hinge_end = 0 if doubt is None else len(base), solver.driven

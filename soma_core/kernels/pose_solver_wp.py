@@ -190,7 +190,7 @@ class PoseSolver:
         numbers = self._on_device(damping, like)
         given, _kept = self._soft(soft)
         frames = [one.contiguous() for one in (target, relative, hips, threshold, mass)]
-        self._launch(
+        self.launch(
             kernel, constants[0], like,
             (*given, as_warp(numbers), longest, stiffness, *map(as_warp, frames), *map(as_warp, outputs)),
             task={"iterations": iterations, "forced": int(forced), "soft_count": len(soft.columns),
@@ -226,7 +226,7 @@ class PoseSolver:
         activations = [relative.new_empty(frames if whole else 0, few) for _ in range(3)]
         kernel = self._tree(relative, constants).posed
         given = relative.contiguous(), hips.contiguous(), turns, places, transforms, *activations
-        self._launch(kernel, constants[0], relative, tuple(map(as_warp, given)), task={"outcome": int(whole)})
+        self.launch(kernel, constants[0], relative, tuple(map(as_warp, given)), task={"outcome": int(whole)})
         return turns, places, transforms, *activations
 
     def slopes(
@@ -248,7 +248,7 @@ class PoseSolver:
         frames = [relative, hips, forces, *(none if one is None else one for one in (pull, activity))]
         given = *(one.contiguous() for one in frames), slope, residual
         kernel = self._tree(relative, constants).slopes
-        self._launch(kernel, constants[0], relative, tuple(map(as_warp, given)))
+        self.launch(kernel, constants[0], relative, tuple(map(as_warp, given)))
         return _ascending(slope), residual
 
     def moved(
@@ -259,7 +259,7 @@ class PoseSolver:
         given = relative.contiguous(), hips.contiguous(), _ascending(step).contiguous(), *outputs
         none = relative.new_zeros(1)
         softs = torch.zeros(1, dtype=torch.int32, device=relative.device)
-        self._launch(
+        self.launch(
             step_kernels(scalar_name(relative.dtype), lane_count(relative), shared=constants[1]).moved,
             constants[0], relative,
             (as_warp(softs), as_warp(none), longest, *map(as_warp, given)), task={"hinge_end": self.driven},
@@ -285,7 +285,7 @@ class PoseSolver:
         rows, shown = frame_rows(squares, lanes), tuple(map(as_warp, given))
         kernel = step_kernels(scalar_name(relative.dtype), lanes, shared=True).doubted
         shown = *shown[:2], as_rows(rows), *shown[2:]
-        self._launch(kernel, relative.new_zeros(1, 1, 1), relative, shown, task={"soft_count": len(columns)})
+        self.launch(kernel, relative.new_zeros(1, 1, 1), relative, shown, task={"soft_count": len(columns)})
         return share, _ascending(slope)
 
     @staticmethod
@@ -305,7 +305,7 @@ class PoseSolver:
         frames = [one.contiguous() for one in (relative, hips, damping, mass)]
         frames += [none if one is None else one.contiguous() for one in (activity, scale)]
         given, _kept = self._soft(soft)
-        self._launch(
+        self.launch(
             kernel, constants[0], relative, (*given, stiffness, *map(as_warp, frames)), kept=kept,
             task={"soft_count": len(soft.columns), "hinge_end": self.columns if soft.hinged else self.driven},
         )  # fmt: skip
@@ -317,14 +317,14 @@ class PoseSolver:
         out = torch.empty_like(given)
         kernel = solution_kernels(scalar_name(slope.dtype), lane_count(slope)).solved
         none = slope.new_zeros(1, 1, 1)
-        self._launch(kernel, none, slope, (as_warp(given), as_warp(out)), kept=factor.kept)
+        self.launch(kernel, none, slope, (as_warp(given), as_warp(out)), kept=factor.kept)
         return _ascending(out)
 
     def variances(self, factor: Factor) -> Tensor:
         """Traces (F, n) of the variables' own blocks of the matrix's inverse, ascending."""
         out = factor.kept.new_empty(factor.count, self.columns - self.driven)
         kernel = solution_kernels(scalar_name(out.dtype), lane_count(out)).varied
-        self._launch(kernel, out.new_zeros(1, 1, 1), out, (as_warp(out),), kept=factor.kept)
+        self.launch(kernel, out.new_zeros(1, 1, 1), out, (as_warp(out),), kept=factor.kept)
         return out.flip(1)
 
     def _soft(self, soft: Soft):
@@ -333,7 +333,8 @@ class PoseSolver:
         kept = columns, soft.numbers, frame_rows(reference.flatten(1), lane_count(reference))
         return (as_warp(columns), as_warp(soft.numbers), as_rows(kept[2])), kept
 
-    def _launch(self, kernel, constants: Tensor, like: Tensor, given: tuple, *, kept=None, task=None) -> None:
+    def launch(self, kernel, constants: Tensor, like: Tensor, given: tuple, *, kept=None, task=None) -> None:
+        """Start a kernel of the solver's tables and memory on the frames of `like`."""
         lanes = lane_count(like)
         frames = len(like)
         groups = -(-frames // lanes)

@@ -2,6 +2,7 @@
 
 import functools
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -9,6 +10,8 @@ import torch
 from soma_core.geometry.rotations import axis_angle_to_matrix, matrix_to_axis_angle
 from soma_core.inversion.limbs import _SHARES
 from soma_core.inversion.model import PoseModel
+from soma_core.inversion.priors import PosePriors, twist_doubt
+from soma_core.layer import SomaLayer
 from tests.bodies import randn
 from tests.inversion.driven_layers import as_pose, layer_of, problem_of
 
@@ -110,9 +113,9 @@ def limb_of(model, joint):
     return found
 
 
-def searched(model, problem, pose):
+def searched(model, problem, pose, held=(), **options):
     view, scale = model.view(problem, pose), model.scale(problem).expand(len(pose.relative))
-    return model.share(pose, view, problem, scale, model.solver.variables)
+    return model.share(pose, view, problem, scale, model.solver.variables, held, **options)
 
 
 @pytest.mark.parametrize("joint", ["LeftArm", "RightArm", "LeftLeg", "RightLeg"])
@@ -159,6 +162,41 @@ def test_a_share_moves_only_its_bone_and_the_next():
     torch.testing.assert_close(places, stood, atol=2e-3, rtol=0)  # the next joint lies nearly on the axis
     angle = matrix_to_axis_angle(old[:, limb.own].mT @ turns[:, limb.own]).norm(dim=-1)
     torch.testing.assert_close(angle, torch.tensor([0.4, 0.9], dtype=torch.float64), atol=1e-6, rtol=0)
+
+
+@functools.cache
+def _by_kernels(dtype):
+    layer = layer_of(correct=True) if dtype == torch.float64 else SomaLayer("soma", lod="low")
+    return layer, PoseModel(layer, plain=False, warp=True)
+
+
+@pytest.mark.parametrize("bodies", [1, 19])
+@pytest.mark.parametrize("near", [False, True])
+@pytest.mark.parametrize(
+    ("dtype", "rounding"),
+    [(torch.float32, 2e-5), pytest.param(torch.float64, 1e-9, marks=pytest.mark.slow)],  # 8 s to compile
+)
+def test_a_kernel_finds_the_same_shares(dtype, rounding, near, bodies):
+    """Of more frames than lanes, with doubt of twists, from poses that miss by noise and turned limbs."""
+    layer, model = _by_kernels(dtype)
+    names = list(layer.joint_names)
+    identity = layer.identity({"shape": randn(bodies, 16, seed=1).to(dtype)})
+    rotations = axis_angle_to_matrix(0.3 * randn(19, 77, 3, seed=2)).to(dtype)
+    target = layer.pose(identity, rotations, HIPS.to(dtype)).vertices
+    problem = problem_of(model, identity, target + 2e-3 * randn(*target.shape, seed=3).to(dtype))
+    variables = [names[j - 1] for j in model.solver.variables.tolist()]
+    doubt = twist_doubt(PosePriors(), variables, dtype=dtype, device="cpu")
+    problem = replace(problem, doubt=doubt)
+    pose = as_pose(rotations, HIPS.to(dtype) - problem.origin)
+    for number, limb in enumerate(model.share.limbs):
+        off = 0.8 * torch.sin(torch.arange(19.0) + number).to(dtype)
+        model.share.turn(pose.relative, limb, off)
+    kernels = {"steps": model.steps, "constants": model.constants(problem.rest)}
+    held = {model.share.limbs[1].end}
+    twin, found = (searched(model, problem, pose, held, near=near, **one) for one in ({}, kernels))
+    moved = (twin.relative - pose.relative).abs().amax((0, 2, 3)) > 0
+    assert moved.sum() == 2 * (len(model.share.limbs) - 1)
+    torch.testing.assert_close(found.relative, twin.relative, atol=rounding, rtol=0)
 
 
 def test_hinges_are_left_alone():
