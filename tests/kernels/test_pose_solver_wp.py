@@ -19,6 +19,7 @@ from soma_core.kernels import (
     nearest_rotation_wp,
     pose_solver_wp,
     skin_moments_wp,
+    twist_share_wp,
 )
 from soma_core.layer import SomaLayer
 from tests.bodies import randn
@@ -386,7 +387,10 @@ def test_frames_abreast_are_fitted_as_frames_in_lanes(options, monkeypatch):
     weights[1:, :200] = 0
     fit = PoseInversion(layer, kernels="warp")
     found = [fit(vertices, identity, weights=given) for given in (None, weights)]
-    for module in (frame_moments_wp, model_residual_wp, nearest_rotation_wp, pose_solver_wp, skin_moments_wp):
+    for module in (
+        frame_moments_wp, model_residual_wp, nearest_rotation_wp, pose_solver_wp, skin_moments_wp,
+        twist_share_wp,
+    ):  # fmt: skip
         monkeypatch.setattr(module, "lane_count", lambda _tensor: 1)
     monkeypatch.setattr("soma_core.inversion.refine.knows_descent", lambda *_: False)  # as on a GPU
     again = [fit(vertices, identity, weights=given) for given in (None, weights)]
@@ -411,7 +415,7 @@ def test_a_frame_takes_no_more_memory_than_is_planned(monkeypatch):
         most = max(most, sum(alive.values()))
         return made
 
-    for module in (model_residual_wp, nearest_rotation_wp, pose_solver_wp, skin_moments_wp):
+    for module in (model_residual_wp, nearest_rotation_wp, pose_solver_wp, skin_moments_wp, twist_share_wp):
         monkeypatch.setattr(module, "lane_count", lambda _tensor: 1)
         monkeypatch.setattr(module, "working_rows", rows)
     monkeypatch.setattr(torch, "get_num_threads", lambda: 1)

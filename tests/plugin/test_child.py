@@ -80,7 +80,7 @@ def test_harm_costs_one_row_and_the_listing_stays_json(site: Path) -> None:
     ended = _soma(site, "--load", "--json", "--timeout", "30")
     rows = {row["name"]: row for row in json.loads(ended.stdout) if row["state"] != "blocked"}
     assert ended.returncode == 3
-    assert rows["soma"]["state"] == "built", rows["soma"]
+    assert rows["soma"]["state"] == "built", rows["soma"]["error"]
     assert "damaged" in rows["-"]["error"]["cause"]
     for name, (_, _, told) in HARM.items():
         row = rows[name]

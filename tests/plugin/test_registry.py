@@ -223,7 +223,7 @@ def test_a_failing_build_is_tried_again() -> None:
 
 def test_a_generator_needs_a_rest_method() -> None:
     plugin = hooks(soma_backend=lambda: SOUND, soma_generator=lambda: "mesh")
-    with pytest.raises(BrokenBackendError, match="soma_generator returned str no object with a rest method"):
+    with pytest.raises(BrokenBackendError, match="soma_generator returned str, no object with a rest method"):
         Registry([FakeEntryPoint("good", plugin)]).generator("good", **BUILD)
 
 
@@ -431,7 +431,7 @@ def test_a_typo_of_the_user_in_a_path_is_not_the_plugins_fault(tmp_path: Path) -
         registry.generator("good", **BUILD, options={"model": str(named)})
     assert state(registry, "good") == "declared"
     (tmp_path / "other").write_text("")
-    with pytest.raises(BrokenBackendError, match="returned str without a rest"):
+    with pytest.raises(BrokenBackendError, match="returned str, no object with a rest"):
         registry.generator("good", **BUILD, options={"model": str(tmp_path / "other")})
 
 

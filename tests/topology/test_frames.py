@@ -54,4 +54,4 @@ def test_unknown_axes_are_refused(wrong):
 
 
 def test_units():
-    assert METRES == {"m": 1.0, "cm": 0.01, "mm": 0.001}
+    assert METRES == {"m": 1.0, "cm": 0.01, "mm": 0.001, "ft": 0.3048, "inch": 0.0254}
