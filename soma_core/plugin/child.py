@@ -6,6 +6,7 @@ there is unpickled or run. Output of the child, that of C code too, goes to stde
 
 from __future__ import annotations
 
+import ctypes
 import importlib
 import json
 import multiprocessing
@@ -149,5 +150,6 @@ def _child(
     with suppress(Exception):
         sys.stdout.flush()
         sys.stderr.flush()
+        ctypes.CDLL(None).fflush(None)  # what C wrote
     connection.close()
     os._exit(0)
