@@ -20,11 +20,11 @@ from soma_core.errors import InputError, SomaError
 from soma_core.evaluation.report import Figure, Report, ShownBody, Table
 from soma_core.evaluation.sam3d_frames import NEUTRAL, make_wrap
 from soma_core.inversion import PoseInversion
-from soma_core.native.identity import fit_identity
 from soma_core.inversion.unposing import blended_turns, posed_turns
 from soma_core.io.mesh_vertices import read_mesh_vertices
 from soma_core.io.vertex_folder import MESH_SUFFIXES, natural
 from soma_core.layer import SomaLayer
+from soma_core.native.identity import fit_identity
 from soma_core.paths import expanded
 from soma_core.plugin.registry import default_registry
 from soma_core.progress import progress
