@@ -415,7 +415,7 @@ def test_a_frame_takes_no_more_memory_than_is_planned(monkeypatch):
         most = max(most, sum(alive.values()))
         return made
 
-    for module in (model_residual_wp, nearest_rotation_wp, pose_solver_wp, skin_moments_wp, twist_share_wp):
+    for module in (model_residual_wp, nearest_rotation_wp, pose_solver_wp, skin_moments_wp):
         monkeypatch.setattr(module, "lane_count", lambda _tensor: 1)
         monkeypatch.setattr(module, "working_rows", rows)
     monkeypatch.setattr(torch, "get_num_threads", lambda: 1)
