@@ -141,15 +141,23 @@ def _child(
             _named(prepare)()
         send({"said": []})  # ready: the caller's limit counts from here
         run(lambda said: send({"said": [said]}), *arguments)
+        _flush()  # the caller ends this process once it has the last document
         send({"said": None})
     except BaseException as error:
         if os.environ.get("SOMA_STRICT") == "1":
             traceback.print_exc()
+        _flush()
         with suppress(Exception):
             send({"raised": f"{type(error).__name__}: {' '.join(str(error).split())}".rstrip(": ")})
-    with suppress(Exception):
-        sys.stdout.flush()
-        sys.stderr.flush()
-        ctypes.CDLL(None).fflush(None)  # what C wrote
     connection.close()
     os._exit(0)
+
+
+def _flush() -> None:
+    """Show what is printed so far, by C as well."""
+    with suppress(Exception):
+        sys.stdout.flush()
+    with suppress(Exception):
+        sys.stderr.flush()
+    with suppress(Exception):
+        ctypes.CDLL(None).fflush(None)
