@@ -27,7 +27,7 @@ _CANDIDATES, _STARTS = 48, 4
 _FEW_FRAMES, _FEW_STEPS = 4, 6
 """Bodies looked at, and those of them followed a few steps on a few frames; the best one goes on."""
 
-_CLEARLY = 0.8
+_CLEARLY = 0.5
 """Share of the error that a rival must stay below."""
 
 _AT_A_TIME = 8
