@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 from soma_core import load_canonical
 from soma_core.errors import InputError
 from soma_core.io.bvh import write_bvh
+from soma_core.io.joint_names import match_joints
 from soma_core.io.joint_order import PARENT_NAMES, USER_JOINTS
 from soma_core.io.skeleton_files import read_skeleton
 from soma_core.io.skeleton_motion import soma_skeleton
@@ -357,3 +358,90 @@ def test_hands_and_feet_come_to_where_they_are_there(make, rig):
     for name in ("Hips", "Chest", "Head", "LeftShoulder"):
         index = USER_JOINTS.index(name)
         np.testing.assert_allclose(turns[1][:, index], turns[0][:, index], atol=1e-5)
+
+
+DIALECTS = {  # hips; thigh shin foot toe; neck head; collar arm forearm hand, * for the side
+    "Mixamo": "mixamorig:Hips; *UpLeg *Leg *Foot *ToeBase; Neck Head; *Shoulder *Arm *ForeArm *Hand; "
+    "mixamorig:Left mixamorig:Right",
+    "Mixamo in Blender": "mixamorig12_Hips; *UpLeg *Leg *Foot *ToeBase; Neck Head; *Shoulder *Arm *ForeArm "
+    "*Hand; mixamorig12_Left mixamorig12_Right",
+    "CMU's ASF": "root; *femur *tibia *foot *toes; lowerneck head; *clavicle *humerus *radius *wrist; l r",
+    "Poser": "hip; *Thigh *Shin *Foot -; neck head; *Collar *Shldr *ForeArm *Hand; l r",
+    "Daz": "hip; *ThighBend *Shin *Foot *Toe; neckLower head; *Collar *ShldrBend *ForearmBend *Hand; l r",
+    "Second Life": "mPelvis; mHip* mKnee* mAnkle* mToe*; mNeck mHead; mCollar* mShoulder* mElbow* mWrist*; "
+    "Left Right",
+    "Perception Neuron": "Robot_Hips; *UpLeg *Leg *Foot -; Robot_Neck Robot_Head; *Shoulder *Arm *ForeArm "
+    "*Hand; Robot_Left Robot_Right",
+    "OptiTrack": "Hip; *Thigh *Shin *Foot *Toe; Neck Head; *Shoulder *UArm *FArm *Hand; L R",
+    "3ds Max": "Bip01 Pelvis; * Thigh,* Calf,* Foot,* Toe0; Bip01 Neck,Bip01 Head; * Clavicle,* UpperArm,"
+    "* Forearm,* Hand; Bip01 L,Bip01 R",
+    "Talking With Hands": "b_root; b_*_upleg b_*_leg b_*_foot b_*_toe; b_neck0 b_head; b_*_shoulder b_*_arm "
+    "b_*_forearm b_*_wrist; l r",
+    "Rigify": "spine; thigh.* shin.* foot.* toe.*; spine.004 spine.006; shoulder.* upper_arm.* forearm.* "
+    "hand.*; L R",
+    "VRoid": "J_Bip_C_Hips; J_Bip_*_UpperLeg J_Bip_*_LowerLeg J_Bip_*_Foot J_Bip_*_ToeBase; J_Bip_C_Neck "
+    "J_Bip_C_Head; J_Bip_*_Shoulder J_Bip_*_UpperArm J_Bip_*_LowerArm J_Bip_*_Hand; L R",
+    "Kinect": "SpineBase; Hip* Knee* Ankle* Foot*; Neck Head; - Shoulder* Elbow* Wrist*; Left Right",
+    "Azure Kinect": "PELVIS; HIP_* KNEE_* ANKLE_* FOOT_*; NECK HEAD; CLAVICLE_* SHOULDER_* ELBOW_* WRIST_*; "
+    "LEFT RIGHT",
+    "Isaac": "Pelvis; *_Hip *_Knee *_Ankle *_Toe; Neck Head; *_Thorax *_Shoulder *_Elbow *_Wrist; L R",
+    "SMPL's FBX": "m_avg_Pelvis; *_Hip *_Knee *_Ankle *_Foot; m_avg_Neck m_avg_Head; *_Collar *_Shoulder "
+    "*_Elbow *_Wrist; m_avg_L m_avg_R",
+    "Maya": "hips_jnt; *_upLeg_jnt *_leg_jnt *_foot_jnt *_toe_jnt; neck_jnt head_jnt; *_shoulder_jnt "
+    "*_arm_jnt *_forearm_jnt *_hand_jnt; l r",
+    "mocopi": "root; *_up_leg *_low_leg *_foot *_toes; neck_1 head; *_shoulder *_up_arm *_low_arm "
+    "*_hand; l r",
+    "Rokoko": "Hips; *Thigh *Shin *Foot *Toe; Neck Head; *Shoulder *Arm *ForeArm *Hand; Left Right",
+    "MMD": "センター; *足 *ひざ *足首 *つま先; 首 頭; *肩 *腕 *ひじ *手首; 左 右",
+    "no name of its own": "body; *UpLeg *Leg *Foot *Toe; Neck Head; *Shoulder *Arm *ForeArm *Hand; "
+    "Left Right",
+}  # fmt: skip
+LIMBS = ("Leg", "Shin", "Foot", "ToeBase"), ("Shoulder", "Arm", "ForeArm", "Hand")
+
+
+@pytest.mark.parametrize("tool", DIALECTS)
+def test_names_of_tools_are_known(tool):
+    hips, legs, trunk, arms, sides = (
+        part.strip().split("," if "," in part else " ") for part in DIALECTS[tool].split(";")
+    )
+    names, parents, meant = [], [], {}
+
+    def chain(above, targets, found):
+        for target, name in zip(targets, found, strict=True):
+            if name == "-":
+                continue
+            meant[target] = len(names)
+            names.append(name)
+            parents.append(above)
+            above = len(names) - 1
+            if target.endswith("Hand"):  # with the tips that Mixamo has, which look like a fourth phalanx
+                stem = name.replace("Wrist", "Hand")
+                fingers = [f"{target}Index{number}" for number in (2, 3, 4, "tip")]
+                chain(above, fingers, [f"{stem}Index{number}" for number in (1, 2, 3, 4)])
+        return above
+
+    chain(-1, ["Hips"], [" ".join(hips)])
+    for side, spelled in zip(("Left", "Right"), sides, strict=True):
+        chain(0, [side + part for part in LIMBS[0]], [name.replace("*", spelled) for name in legs])
+    neck = chain(0, ["Neck1", "Head"], trunk)
+    for side, spelled in zip(("Left", "Right"), sides, strict=True):
+        chain(
+            parents[neck], [side + part for part in LIMBS[1]], [name.replace("*", spelled) for name in arms]
+        )
+    found = match_joints(names, np.array(parents))
+    body = {target: names[joint] for target, joint in meant.items() if "Index" not in target}
+    if tool == "Rigify":
+        del body["Neck1"]  # its spine goes on to the head
+    assert {target: names[joint] for target, joint in found.items() if "Index" not in target} == body
+    if tool == "Mixamo":
+        assert found == {target: joint for target, joint in meant.items() if "tip" not in target}
+
+
+def test_main_joints_of_unknown_names_are_asked_for(caplog):
+    names, parents, _ = biped(LAFAN)
+    strange = tuple(name.replace("RightForeArm", "Unter") for name in names)
+    found = match_joints(strange, parents, source="walk.bvh")
+    assert "RightForeArm" not in found
+    assert "walk.bvh: no joint is known as RightForeArm" in caplog.text
+    assert "one of Unter, pass mapping=FILE" in caplog.text
+    assert len(caplog.records) == 1
