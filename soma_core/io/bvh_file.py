@@ -29,9 +29,14 @@ _CHUNK = 1 << 18
 _ROWS = 128
 _WORD = re.compile(
     rb"(?i:(ROOT|JOINT)[ \t]+([^\r\n{}]+))|(?i:(End)[ \t]*Site[^\r\n{}]*)"
-    rb"|(?i:(OFFSET|CHANNELS)\b([^\r\n{}]*))|(?i:^[ \t]*(MOTION)\b)|([{}])|(?:\#|//)[^\r\n]*|(\S+)",
+    rb"|(?i:(OFFSET|CHANNELS)\b([^\r\n{}]*))|(?i:(?:^|(?<=\r))[ \t]*(MOTION)\b)|([{}])"
+    rb"|(?:\#|//)[^\r\n]*|(\S+)",
     re.MULTILINE,
 )
+_NOTE = re.compile(rb"(?:^|(?<=\s))(?:#|//)[^\r\n]*")
+_MARK = b"\xef\xbb\xbf"
+"""With which some programs begin a text in UTF-8."""
+
 _HEAD = re.compile(rb"(?i:Frames[ \t]*:?[ \t]*(\S+))|(?i:Frame[ \t]*Time[ \t]*:?[ \t]*(\S+))")
 _RATES = (
     24,
@@ -131,7 +136,7 @@ def _hierarchy(path: Path, text: mmap.mmap) -> tuple[_Tree, int]:
     """
     tree, stack, opened = _Tree(), [-1], 0
     pending: int | None = None  # joint whose brace is awaited; -2 for an End Site
-    for word in _WORD.finditer(text):
+    for word in _WORD.finditer(text, len(_MARK) if text[: len(_MARK)] == _MARK else 0):
         kind, name, end, entry, numbers, motion, brace, other = word.groups()
         if motion:
             if opened or not tree.names:
@@ -179,7 +184,7 @@ def _add_joint(path: Path, tree: _Tree, name: str, parent: int) -> None:
 
 def _add_entry(path: Path, tree: _Tree, stack: list[int], entry: bytes, text: bytes) -> None:
     """An offset, of which some programs write a rotation behind the place, or channels."""
-    words, joint = text.split(), stack[-1]
+    words, joint = _with_points(text).split(), stack[-1]
     try:
         if entry == b"OFFSET":
             offset = np.array([float(word) for word in words[:3]])
@@ -214,7 +219,7 @@ def _motion_head(text: mmap.mmap, at: int) -> tuple[str, str | None, int]:
         if found[1]:
             announced = found[1].decode("ascii", "replace")
         else:
-            frame_time = found[2].decode("ascii", "replace")
+            frame_time = _with_points(found[2]).decode("ascii", "replace")
     return announced, frame_time, at
 
 
@@ -264,11 +269,11 @@ def _pieces(text: mmap.mmap, at: int) -> Iterator[bytes]:
 
 def _parsed(path: Path, piece: bytes) -> np.ndarray:
     if b"#" in piece or b"//" in piece:
-        piece = re.sub(rb"(?:#|//)[^\r\n]*", b"", piece)
+        piece = _NOTE.sub(b"", piece)
     if not piece.strip():
         return np.empty(0)
     try:
-        values = numbers_of_text(piece)
+        values = numbers_of_text(_with_points(piece))
         if np.isfinite(values).all():
             return values
     except ValueError:
@@ -280,6 +285,15 @@ def _parsed(path: Path, piece: bytes) -> np.ndarray:
         expected="finite numbers",
         fix="Correct or delete the frame.",
     )
+
+
+def _with_points(text: bytes) -> bytes:
+    """Numbers with a point, which commas stand for or part from each other in some countries and programs."""
+    if b"," not in text and b";" not in text:
+        return text
+    text = text.replace(b";", b" ")
+    decimal = b"." not in text and not re.search(rb",\S*,|,(?:\s|$)", text)
+    return text.replace(b",", b"." if decimal else b" ")
 
 
 def _is_number(word: bytes) -> bool:

@@ -285,7 +285,7 @@ def _phalanges(stem: str, finger: str, side: str, places: Mapping[str, int]) -> 
     thumb = finger == "Thumb"
     first = f"{side}{stem}0" in places
     yield from ((f"{stem}{number}", number + (first or not thumb)) for number in (0, 1, 2, 3))
-    words = ("metacarpal", "proximal", "intermediate", "distal")
+    words: tuple[str, ...] = ("metacarpal", "proximal", "intermediate", "distal")
     if thumb:
         words = words[1:] if f"{side}{stem}intermediate" in places else (*words[:2], "distal")
     yield from ((stem + word, place) for place, word in enumerate(words, start=1))

@@ -148,6 +148,30 @@ def test_what_tools_write_differently_is_read(tmp_path):
 
 
 @pytest.mark.parametrize(
+    "changed",
+    [
+        lambda text: "\ufeff" + text,
+        lambda text: text.replace("\n", "\r"),
+        lambda text: text.replace(".", ","),
+        lambda text: text.replace(".5 ", ",5;").replace(".", ","),
+        lambda text: text.replace(".5 ", ".5, "),
+        lambda text: text.replace("1.5 90.5 2.5 10.5 20.5 30.5 40.5", "1.5,90.5,2.5,10.5,20.5,30.5,40.5"),
+    ],
+    ids=["mark", "returns", "decimal commas", "semicolons", "commas and blanks", "commas"],
+)
+def test_numbers_of_other_countries_and_programs_are_read(changed, tmp_path, caplog):
+    path = written(tmp_path / "a.bvh", 2 * "1.5 90.5 2.5 10.5 20.5 30.5 40.5\n")
+    plain = read_bvh(path)
+    path.write_bytes(changed(path.read_text()).encode())
+    found = read_bvh(path)
+    assert found.fps == plain.fps == 30
+    np.testing.assert_array_equal(found.rest, plain.rest)
+    np.testing.assert_array_equal(found.root, plain.root)
+    np.testing.assert_array_equal(found.rotations, plain.rotations)
+    assert not caplog.records
+
+
+@pytest.mark.parametrize(
     ("head", "fps", "said"),
     [
         ("Frames: 2\nFrame Time: 0.0083333\n", 120, ""),
@@ -180,7 +204,7 @@ def test_a_frame_that_is_cut_off_is_left_out(tmp_path, caplog):
         ({"head": "Frames: 2\nFrame Time: 2\n"}, r"Frame Time: got 2.*fps=30"),
         ({"roots": 2}, r"root: got 2 skeletons.*root=Hips"),
         ({"rows": "0 90 0 1 nan 3 4\n"}, r"MOTION: got 'nan'"),
-        ({"rows": "0,5 90 0 1 2 3 4\n"}, r"MOTION: got '0,5'"),
+        ({"rows": "0.5 90 0 1 -1.#IND00 3 4\n"}, r"MOTION: got '-1.#IND00'"),
         ({"root": "CHANNELS 3 Xrotation"}, r"unreadable CHANNELS of 'Hips'"),
         ({"joint": JOINT.replace("{root}", "OFFSET 1 2 x")}, r"unreadable OFFSET of 'Hips'"),
     ],
