@@ -272,10 +272,9 @@ def _above(joint: int, parents: np.ndarray) -> Iterator[int]:
 def _fingers(side: str, places: Mapping[str, int]) -> Iterator[tuple[str, str]]:
     """Key of a name and joint here; numbers count from the first phalanx on, of thumbs from the hand."""
     for number, (finger, spellings) in enumerate(_FINGERS.items()):
-        for spelling in spellings:
-            for stem in (f"hand{spelling}", spelling, f"f{spelling}", f"inhand{spelling}"):
-                for key, place in _phalanges(stem, finger, side, places):
-                    yield side + key, f"{side}Hand{finger}{place}"
+        for stem in [form.format(each) for each in spellings for form in ("hand{}", "{}", "f{}", "inhand{}")]:
+            for key, place in _phalanges(stem, finger, side, places):
+                yield side + key, f"{side}Hand{finger}{place}"
         for place, end in enumerate(("", "1", "2")):  # 3ds Max
             yield f"{side}finger{number}.{end}", f"{side}Hand{finger}{place + 1 + (finger != 'Thumb')}"
 
