@@ -22,6 +22,9 @@ SOURCE_SHA256 = {
     "SOMA_wrap.obj": "0e9caa78848b27c32f69601d289aeea8835237c38d02c8b0c0fce8f6ee699549",
 }
 
+_JAW_IN_THE_UPPER_LIP = (4521, 13596, 15858)
+"""Vertices inside the upper lip that the source turns with the jaw: spikes across an open mouth."""
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class SourceRig:
@@ -90,6 +93,15 @@ def _read_wrap(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return np.array(quads, np.int32), np.array(uv, np.float32), np.array(uv_quads, np.int32)
 
 
+def _with_the_lip_mended(weights: np.ndarray, triangles: np.ndarray) -> np.ndarray:
+    """Give the three vertices of the upper lip that the source binds to the jaw the mean weights around them."""
+    mended = weights.copy()
+    inside = np.isin(triangles, _JAW_IN_THE_UPPER_LIP)
+    around = np.setdiff1d(triangles[inside.any(1)], _JAW_IN_THE_UPPER_LIP)
+    mended[list(_JAW_IN_THE_UPPER_LIP)] = weights[around].mean(0)
+    return mended
+
+
 def read_source(folder: Path | None = None) -> SourceRig:
     """Read the pinned source files.
 
@@ -108,7 +120,7 @@ def read_source(folder: Path | None = None) -> SourceRig:
         rig = torch.load(_pinned(folder, "soma_rig.pt"), weights_only=True)
     triangles = torch.load(_pinned(folder, "soma_faces.pt"), weights_only=True).numpy()
     quads, uv, uv_quads = _read_wrap(_pinned(folder, "SOMA_wrap.obj"))
-    weights = rig["skinning_weights"].numpy()
+    weights = _with_the_lip_mended(rig["skinning_weights"].numpy(), triangles)
     names = tuple(rig["bone_labels"])
     # The source's own joint regressor leaves the bags out of the row of HeadEnd (and only them).
     regressed = rig["sparse_rbf_matrix"].to_dense()[names.index("HeadEnd")].numpy() != 0

@@ -124,6 +124,18 @@ def test_mirror_swaps_the_weights_of_left_and_right(mid):
     assert difference.mean() < 1e-4  # the painted weights are symmetric but for a few vertices
 
 
+def test_no_vertex_follows_other_joints_than_the_skin_around_it(mid):
+    """The source binds three vertices inside the upper lip to the jaw: spikes across an open mouth."""
+    mesh, rig = mid
+    weights = rig.skin.toarray()
+    ends = np.concatenate([mesh.triangles[:, pair] for pair in ([0, 1], [1, 2], [2, 0])])  # both ways
+    around = np.zeros_like(weights)
+    np.add.at(around, ends[:, 0], weights[ends[:, 1]])
+    around /= np.bincount(ends[:, 0], minlength=len(weights))[:, None]
+
+    assert np.abs(weights - around).max() < 0.3
+
+
 def test_face_interior_is_one_mouth_bag_and_two_eye_bags(mid, low):
     mesh, _ = mid
     assert len(mesh.face_interior) == 691
