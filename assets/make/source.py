@@ -94,7 +94,7 @@ def _read_wrap(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def _with_the_lip_mended(weights: np.ndarray, triangles: np.ndarray) -> np.ndarray:
-    """Give the three vertices of the upper lip that the source binds to the jaw the mean weights around them."""
+    """Give the three vertices of the upper lip that the source binds to the jaw the mean weights around."""
     mended = weights.copy()
     inside = np.isin(triangles, _JAW_IN_THE_UPPER_LIP)
     around = np.setdiff1d(triangles[inside.any(1)], _JAW_IN_THE_UPPER_LIP)
