@@ -64,9 +64,12 @@ class GlbBuffer:
             {
                 "componentType": _COMPONENTS["float32"], "count": count, "type": "VEC3",
                 "min": bounds.min(axis=0).tolist(), "max": bounds.max(axis=0).tolist(),
-                "sparse": {
-                    "count": len(ids), "values": {"bufferView": views[1]},
-                    "indices": {"bufferView": views[0], "componentType": _COMPONENTS[np.dtype(small).name]},
+                "sparse": {  # VTK (9.7) wants the offsets that glTF lets one leave out
+                    "count": len(ids), "values": {"bufferView": views[1], "byteOffset": 0},
+                    "indices": {
+                        "bufferView": views[0], "byteOffset": 0,
+                        "componentType": _COMPONENTS[np.dtype(small).name],
+                    },
                 },
             }
         )  # fmt: skip

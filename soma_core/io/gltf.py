@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,7 @@ from soma_core.cache import atomic_write
 from soma_core.errors import InputError
 from soma_core.geometry.mesh import following_corners, vertex_normals
 from soma_core.io.clip import SkinnedClip, linear_colour
+from soma_core.io.eyeballs import Eyeball, eyeball, eyeball_materials, eyeballs
 from soma_core.io.glb import GlbBuffer, glb_bytes
 from soma_core.rig.mesh import CanonicalMesh
 
@@ -30,7 +32,7 @@ def write_gltf(path: str | Path, clip: SkinnedClip) -> None:
     All influences are kept in as many JOINTS_n / WEIGHTS_n sets as needed, heaviest first, so that a
     viewer that reads only the first set still shows the best four. The first v vertices are the canonical
     ones in canonical order; copies that UV seams need follow. Correctives are morph targets, stored sparsely,
-    whose weights the animation moves.
+    whose weights the animation moves. Eyeballs are nodes below the joints of the eyes, without a skin.
 
     Args:
         path: a ``.glb`` file.
@@ -57,8 +59,8 @@ def gltf_bytes(clip: SkinnedClip) -> bytes:
 
 
 def _document(clip: SkinnedClip, buffer: GlbBuffer) -> dict[str, Any]:
-    """The JSON part; node 0 is the mesh, node j + 1 is joint j."""
-    joints = clip.rig.joint_count
+    """The JSON part; node 0 is the mesh, node j + 1 is joint j; eyeballs follow."""
+    joints, eyes = clip.rig.joint_count, eyeballs(clip.rig, clip.t_pose_world)
     roots = [int(j) + 1 for j in np.flatnonzero(clip.rig.parents < 0)]
     asset: dict[str, Any] = {"version": "2.0", "generator": "SOMA Core"}
     if clip.metadata.get("licence"):
@@ -69,9 +71,12 @@ def _document(clip: SkinnedClip, buffer: GlbBuffer) -> dict[str, Any]:
         "asset": asset | {"extras": extras},
         "scene": 0,
         "scenes": [{"nodes": [0, *roots]}],
-        "nodes": [{"name": clip.name, "mesh": 0, "skin": 0}, *_joint_nodes(clip)],
-        "meshes": [_mesh(clip, buffer)],
-        "materials": [_material(clip)],
+        "nodes": [{"name": clip.name, "mesh": 0, "skin": 0}, *_joint_nodes(clip, eyes)],
+        "meshes": [_mesh(clip, buffer), *([_eye_mesh(eyes[0].radius, buffer)] if eyes else [])],
+        "materials": [
+            _material("Skin", clip.colour),
+            *(_material(name, colour, 0.2) for name, colour, _ in eyeball_materials() if eyes),
+        ],
         "skins": [
             {
                 "name": clip.name,
@@ -84,17 +89,35 @@ def _document(clip: SkinnedClip, buffer: GlbBuffer) -> dict[str, Any]:
     }
 
 
-def _material(clip: SkinnedClip) -> dict[str, Any]:
+def _material(name: str, colour: tuple[float, float, float], roughness: float = 0.6) -> dict[str, Any]:
     surface = {
-        "baseColorFactor": [*linear_colour(clip.colour), 1.0],
+        "baseColorFactor": [*linear_colour(colour), 1.0],
         "metallicFactor": 0.0,
-        "roughnessFactor": 0.6,
+        "roughnessFactor": roughness,
     }
-    return {"name": "Skin", "pbrMetallicRoughness": surface}
+    return {"name": name, "pbrMetallicRoughness": surface}
 
 
-def _joint_nodes(clip: SkinnedClip) -> list[dict[str, Any]]:
-    """One node per joint, resting in the T-pose."""
+def _eye_mesh(radius: float, buffer: GlbBuffer) -> dict[str, Any]:
+    """An eyeball that looks along +Z, for both eyes; material 0 is the skin's."""
+    ball = eyeball()[0].astype(np.float32)
+    attributes = {
+        "POSITION": buffer.add(np.float32(radius) * ball, role="attribute", bounds=True),
+        "NORMAL": buffer.add(ball, role="attribute"),
+    }
+    primitives = [
+        {
+            "attributes": attributes,
+            "indices": buffer.add(faces.reshape(-1).astype(np.uint16), role="index"),
+            "material": number,
+        }
+        for number, (_, _, faces) in enumerate(eyeball_materials(), 1)
+    ]
+    return {"name": "Eyeball", "primitives": primitives}
+
+
+def _joint_nodes(clip: SkinnedClip, eyes: Sequence[Eyeball]) -> list[dict[str, Any]]:
+    """One node per joint, resting in the T-pose, then one per eyeball."""
     local = clip.t_pose_local()
     rotations = Rotation.from_matrix(local[:, :3, :3]).as_quat(canonical=True)
     nodes = []
@@ -108,6 +131,11 @@ def _joint_nodes(clip: SkinnedClip) -> list[dict[str, Any]]:
         if len(children):
             node["children"] = (children + 1).tolist()
         nodes.append(node)
+    for eye in eyes:
+        turn = Rotation.from_matrix(eye.local[:3, :3]).as_quat(canonical=True).tolist()
+        place = {"translation": eye.local[:3, 3].tolist(), "rotation": turn}
+        nodes.append({"name": eye.name, "mesh": 1, **place})
+        nodes[eye.joint].setdefault("children", []).append(len(nodes))
     return nodes
 
 

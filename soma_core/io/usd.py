@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,7 @@ from soma_core.cache import atomic_write
 from soma_core.errors import InputError
 from soma_core.geometry.mesh import vertex_normals
 from soma_core.io.clip import SkinnedClip, linear_colour
+from soma_core.io.eyeballs import Eyeball, eyeball, eyeball_materials, eyeballs
 from soma_core.io.vertex_writers import MeshFrames
 
 __all__ = ["write_usd", "write_usd_points"]
@@ -25,8 +27,8 @@ def write_usd(path: str | Path, clip: SkinnedClip) -> None:
     """Write `clip` as UsdSkel: metres, +Y up, one time code a frame, the T-pose as rest.
 
     The skeleton holds the identity's bind and T-pose transforms, the animation is separate from them, and
-    the mesh keeps every skin influence and its UVs; correctives are blend shapes. `clip.metadata` goes to the
-    layer's custom data.
+    the mesh keeps every skin influence and its UVs; correctives are blend shapes, eyeballs meshes that hang
+    on one joint each. `clip.metadata` goes to the layer's custom data.
 
     Args:
         path: ``.usdc`` (binary, a third of the size), ``.usda`` (text) or ``.usd``.
@@ -108,7 +110,14 @@ def _stage(clip: SkinnedClip) -> Any:
     _bind(mesh, f"{scope}/Skeleton", clip)
     if clip.shapes is not None:
         _add_shapes(stage, mesh, f"{scope}/Skeleton/Animation", clip)
-    _add_material(stage, mesh, f"{scope}/Material", clip)
+    material = _material(stage, f"{scope}/Material", clip.colour)
+    mesh.CreateDisplayColorAttr([linear_colour(clip.colour)])
+    _bind_material(mesh.GetPrim(), material)
+    eyes = eyeballs(clip.rig, clip.t_pose_world)
+    if eyes:
+        shades = [_material(stage, f"{scope}/{name}", colour, 0.2) for name, colour, _ in eyeball_materials()]
+    for eye in eyes:
+        _add_eyeball(stage, f"{scope}/{eye.name}", clip, eye, shades)
     extent = root.CreateExtentAttr()
     for frame in range(clip.frame_count):
         extent.Set(UsdGeom.Boundable.ComputeExtentFromPlugins(root, frame), frame)
@@ -129,7 +138,7 @@ def _joint_paths(clip: SkinnedClip) -> list[str]:
     return paths
 
 
-def _matrices(transforms: np.ndarray) -> Any:
+def _matrices(transforms: Iterable[np.ndarray]) -> Any:
     """USD matrices of column-vector transforms: USD multiplies row vectors, hence the transpose."""
     from pxr import Gf, Vt
 
@@ -230,15 +239,44 @@ def _add_shapes(stage: Any, mesh: Any, animation: str, clip: SkinnedClip) -> Non
         weights.Set(Vt.FloatArray.FromNumpy(np.ascontiguousarray(row)), frame)
 
 
-def _add_material(stage: Any, mesh: Any, path: str, clip: SkinnedClip) -> None:
+def _add_eyeball(stage: Any, path: str, clip: SkinnedClip, eye: Eyeball, materials: Sequence[Any]) -> None:
+    """A mesh that moves with one joint, white, iris and pupil as its subsets."""
+    from pxr import UsdGeom, UsdShade, UsdSkel, Vt
+
+    mesh, ball = UsdGeom.Mesh.Define(stage, path), eyeball()[0]
+    points, parts = (eye.radius * ball).astype(np.float32), eyeball_materials()
+    faces = np.concatenate([part for _, _, part in parts])
+    mesh.CreatePointsAttr(Vt.Vec3fArray.FromNumpy(points))
+    mesh.CreateExtentAttr(Vt.Vec3fArray.FromNumpy(np.stack([points.min(axis=0), points.max(axis=0)])))
+    _set_faces(mesh, np.full(len(faces), 3), faces.ravel(), np.empty((0, 2)), np.empty(0))
+    mesh.CreateNormalsAttr(Vt.Vec3fArray.FromNumpy(ball.astype(np.float32)))
+    mesh.SetNormalsInterpolation(UsdGeom.Tokens.vertex)
+    binding = UsdSkel.BindingAPI.Apply(mesh.GetPrim())
+    binding.CreateSkeletonRel().SetTargets([mesh.GetPath().GetParentPath().AppendChild("Skeleton")])
+    binding.CreateGeomBindTransformAttr(_matrices([clip.bind_world[eye.joint] @ eye.local])[0])
+    binding.SetRigidJointInfluence(eye.joint, 1.0)
+    first = 0
+    for (name, _, part), material in zip(parts, materials, strict=True):
+        subset = UsdShade.MaterialBindingAPI.Apply(mesh.GetPrim()).CreateMaterialBindSubset(
+            name, _ints(np.arange(first, first + len(part)))
+        )
+        _bind_material(subset.GetPrim(), material)
+        first += len(part)
+
+
+def _material(stage: Any, path: str, colour: tuple[float, float, float], roughness: float = 0.6) -> Any:
     from pxr import Gf, Sdf, UsdShade
 
-    colour = Gf.Vec3f(*linear_colour(clip.colour))
-    mesh.CreateDisplayColorAttr([colour])
     material = UsdShade.Material.Define(stage, path)
     shader = UsdShade.Shader.Define(stage, f"{path}/Surface")
     shader.CreateIdAttr("UsdPreviewSurface")
-    shader.CreateInput("diffuseColor", Sdf.ValueTypeNames.Color3f).Set(colour)
-    shader.CreateInput("roughness", Sdf.ValueTypeNames.Float).Set(0.6)
+    shader.CreateInput("diffuseColor", Sdf.ValueTypeNames.Color3f).Set(Gf.Vec3f(*linear_colour(colour)))
+    shader.CreateInput("roughness", Sdf.ValueTypeNames.Float).Set(roughness)
     material.CreateSurfaceOutput().ConnectToSource(shader.ConnectableAPI(), "surface")
-    UsdShade.MaterialBindingAPI.Apply(mesh.GetPrim()).Bind(material)
+    return material
+
+
+def _bind_material(prim: Any, material: Any) -> None:
+    from pxr import UsdShade
+
+    UsdShade.MaterialBindingAPI.Apply(prim).Bind(material)

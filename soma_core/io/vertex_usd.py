@@ -135,7 +135,10 @@ class _BlendShapes:
 
 
 def _moving_mesh(path: Path, stage: Any) -> tuple[Any, Any, list[float]]:
-    """The mesh, its (skinning query, skeleton query) or None, and its sample times."""
+    """The mesh, its (skinning query, skeleton query) or None, and its sample times.
+
+    What hangs on one joint, such as an eyeball, is left out where there is more.
+    """
     from pxr import UsdGeom
 
     skins = _skinned(stage)
@@ -149,6 +152,7 @@ def _moving_mesh(path: Path, stage: Any) -> tuple[Any, Any, list[float]]:
             times = animation.GetJointTransformTimeSamples() if animation else []
         found.append((mesh, skin, list(times)))
     moving = [row for row in found if row[2]] or found
+    moving = [row for row in moving if row[1] is None or not row[1][0].IsRigidlyDeformed()] or moving
     if len(moving) != 1:
         names = ", ".join(str(mesh.GetPath()) for mesh, _, _ in moving)
         raise InputError(

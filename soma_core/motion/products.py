@@ -24,8 +24,7 @@ from soma_core.motion.played import MovingBodies, Played, placing_of
 from soma_core.motion.writers import WRITERS, WriteOptions
 from soma_core.options import BvhChoice, Picture, VideoChoice
 from soma_core.skeleton.identity import Identity
-from soma_core.view.eyes import with_eyes
-from soma_core.view.picture import backend_colour, contact_sheet
+from soma_core.view.picture import backend_colour, contact_sheet, with_eyes
 from soma_core.view.stage import Body
 from soma_core.view.video import write_video
 

@@ -16,8 +16,7 @@ from soma_core.motion.models import open_layer
 from soma_core.plugin.errors import BackendError
 from soma_core.plugin.registry import default_registry
 from soma_core.shape_space.sampling import sample_parameters
-from soma_core.view.eyes import with_eyes
-from soma_core.view.picture import backend_colour, gallery
+from soma_core.view.picture import backend_colour, gallery, with_eyes
 from soma_core.view.stage import Body
 
 if TYPE_CHECKING:

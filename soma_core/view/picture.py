@@ -13,12 +13,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from soma_core.cache import atomic_write
+from soma_core.io.eyeballs import EYES, eyeball, eyeball_places
+from soma_core.rig.skeleton import Rig
 from soma_core.view.stage import AZIMUTH, PAPER, VIEW_ANGLE, Body, camera_axes, open_stage
 
 if TYPE_CHECKING:
     from PIL.Image import Image
 
-__all__ = ["backend_colour", "contact_sheet", "framing", "gallery", "sheet_width"]
+__all__ = ["backend_colour", "contact_sheet", "framing", "gallery", "sheet_width", "with_eyes"]
 
 # The paper's figures: SOMA green, MHR blue, SMPL pink, Anny yellow.
 _COLOURS = {
@@ -238,3 +240,25 @@ def _stacked(pictures: Sequence[Image]) -> Image:
 
 def _rgb(colour: Sequence[float]) -> tuple[int, ...]:
     return tuple(round(255 * c) for c in colour)
+
+
+def with_eyes(body: Body, transforms: np.ndarray, rig: Rig) -> Body:
+    """The same body to draw, with eyeballs that look where their joints do.
+
+    Args:
+        body: a posed canonical body.
+        transforms: (78, 4, 4) world transforms of its joints [m].
+        rig: of the body.
+    """
+    turns = transforms[1:, :3, :3] @ rig.t_pose_world[1:, :3, :3].transpose(0, 2, 1)
+    ball, faces, shades = eyeball()
+    radius, centres = eyeball_places(transforms[1:, :3, 3], turns)
+    count = len(body.vertices)
+    skin = np.tile(body.colour, (count, 1)) if body.shades is None else body.shades
+    balls = [radius * ball @ turns[eye].T + centre for eye, centre in zip(EYES, centres, strict=True)]
+    return replace(
+        body,
+        vertices=np.concatenate([body.vertices, *balls]),
+        triangles=np.concatenate([body.triangles, faces + count, faces + count + len(ball)]),
+        shades=np.concatenate([skin, shades / 255, shades / 255]),
+    )

@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from soma_core.io.eyeballs import EYES, eyeball, eyeball_places
 from soma_core.io.joint_order import PARENT_NAMES, USER_JOINTS
 from soma_core.view.error_picture import error_colours, scale_top
-from soma_core.view.eyes import EYES, eyeball, eyeball_places
 from soma_core.view.picture import backend_colour
 from soma_core.viewer.session import Figure, Session, Shape
 

@@ -156,27 +156,46 @@ class View {
     this.camera = new Three.PerspectiveCamera(32, 1, 0.05, 500);
     this.controls = new Three.OrbitControls(this.camera, canvas);
     this.addBody(glb);
+    this.addEyes(glb);
     this.addSkeleton();
     this.addLights();
     this.place();
     addEventListener("resize", () => this.resize());
     this.resize();
   }
+  material(glb, index) {
+    const surface = glb.json.materials[index].pbrMetallicRoughness;
+    const material = new Three.MeshStandardMaterial({ roughness: surface.roughnessFactor, metalness: 0 });
+    material.color.setRGB(...surface.baseColorFactor.slice(0, 3));
+    return material;
+  }
+  // Meshes without a skin hang on their nodes.
+  addEyes(glb) {
+    this.eyes = [];
+    for (const { index, mesh } of this.body.nodes.filter((node) => node.mesh > 0))
+      for (const { attributes, indices, material } of glb.json.meshes[mesh].primitives) {
+        const geometry = new Three.BufferGeometry();
+        geometry.setIndex(new Three.BufferAttribute(glb.accessor(indices), 1));
+        geometry.setAttribute("position", new Three.BufferAttribute(glb.accessor(attributes.POSITION), 3));
+        geometry.setAttribute("normal", new Three.BufferAttribute(glb.accessor(attributes.NORMAL), 3));
+        const shown = new Three.Mesh(geometry, this.material(glb, material));
+        shown.matrixAutoUpdate = shown.frustumCulled = false;
+        this.eyes.push({ shown, index });
+        this.scene.add(shown);
+      }
+  }
   addBody(glb) {
     const { body } = this, geometry = new Three.BufferGeometry();
     geometry.setIndex(new Three.BufferAttribute(body.indices, 1));
     geometry.setAttribute("position", new Three.BufferAttribute(body.positions, 3));
     geometry.setAttribute("normal", new Three.BufferAttribute(body.normals, 3));
-    const surface = glb.json.materials[0].pbrMetallicRoughness;
-    const material = new Three.MeshStandardMaterial({ roughness: surface.roughnessFactor, metalness: 0 });
-    material.color.setRGB(...surface.baseColorFactor.slice(0, 3));
-    this.mesh = new Three.Mesh(geometry, material);
+    this.mesh = new Three.Mesh(geometry, this.material(glb, 0));
     this.mesh.frustumCulled = false;
     this.mesh.castShadow = this.mesh.receiveShadow = true;
     this.scene.add(this.mesh);
   }
   addSkeleton() {
-    this.bones = this.body.nodes.filter((node) => node.parent > 0 && this.body.nodes[node.parent].parent > 0);
+    this.bones = this.body.nodes.filter((node) => node.mesh === undefined && node.parent > 0 && this.body.nodes[node.parent].parent > 0);
     const geometry = new Three.BufferGeometry();
     geometry.setAttribute("position", new Three.BufferAttribute(new Float32Array(6 * this.bones.length), 3));
     this.skeleton = new Three.LineSegments(geometry, new Three.LineBasicMaterial({
@@ -236,6 +255,10 @@ class View {
       ends.setXYZ(2 * k + 1, ...point.setFromMatrixPosition(this.body.worlds[bone.index]));
     });
     ends.needsUpdate = true;
+    for (const { shown, index } of this.eyes) {
+      shown.matrix.copy(this.body.worlds[index]);
+      shown.matrixWorldNeedsUpdate = true;
+    }
     const hips = this.place_of_hips(), step = hips.clone().sub(this.hips).setY(0);
     this.hips = hips;
     if (follow) for (const one of [this.camera.position, this.controls.target]) one.add(step);
@@ -327,6 +350,7 @@ soma.ready = (async () => {
     frameCount: body.frameCount, vertexCount: body.canonical, player,
     setFrame: (frame) => { if (player.playing) player.toggle(); player.go(frame); player.view.render(); },
     vertex: (index) => Array.from(body.positions.subarray(3 * index, 3 * index + 3)),
+    node: (name) => body.worlds[body.nodes.findIndex((node) => node.name === name)].toArray(),
     vertices: () => Array.from(body.positions.subarray(0, 3 * body.canonical)),
   });
   return true;
