@@ -33,7 +33,7 @@ from soma_core.inversion.refine import clumping
 from soma_core.inversion.result import InversionResult, joined
 from soma_core.inversion.start import cloud_extent
 from soma_core.inversion.targets import Frames, LadderOptions, Skinning, Stage, Targets
-from soma_core.inversion.whole import is_worse, lopsided, of_another_rig, right_vertices
+from soma_core.inversion.whole import FEW, is_worse, lopsided, of_another_rig, right_vertices
 from soma_core.layer import Kernels, SomaLayer
 from soma_core.rig import load_canonical
 from soma_core.skeleton.identity import Identity
@@ -58,6 +58,9 @@ _AS_GOOD = 1.1
 """Mean error of plain skinning over that of the full model, up to which a frame of another rig is told by the
 former: 0.7 to 1.08 on meshes of Anny's own rig. Of what the full model posed, only bodies that are wrong by
 some millimetres come below, and their angles are as good by either."""
+
+_NO_OTHER = 1.5
+"""The same, from which on a frame is of no other rig."""
 
 _COLLAPSED, _LEFT = 0.1, 0.5
 """A joint whose cloud has less than this share of its extent left cannot be determined; nor can one that a
@@ -339,9 +342,24 @@ class PoseInversion(Derived):
         better = plain.mean_error(part.weights) < _AS_GOOD * full.mean_error(part.weights)
         better &= plain.converged | ~full.converged
         plain = replace(plain, determined=plain.determined & full.determined)
-        return result.put(rows[better], plain.part(better))
+        result = result.put(rows[better], plain.part(better))
+        own = plain.mean_error(part.weights) > _NO_OTHER * full.mean_error(part.weights)
+        return self._searched(frames, result, rows[own & ~better])
 
-    def _posed(self, frames: Frames, robust: float | None = None) -> tuple[Pose, Problem]:
+    def _searched(self, frames: Frames, result: InversionResult, rows: Tensor) -> InversionResult:
+        """The result, with limbs searched in frames of no other rig, where they may rest in a wrong place."""
+        if not len(rows):
+            return result
+        part, before = frames.part(rows), result.part(rows)
+        pose, problem = self._posed(replace(part, initial=before), foreign=False)
+        found, _ = self._result(part, pose, problem)
+        found = before.where(~(found.residual < before.residual), found)
+        stuck = lopsided(found.vertex_error, part.weights, found.residual, FEW)
+        return result.put(rows, replace(found, converged=found.converged & ~stuck))
+
+    def _posed(
+        self, frames: Frames, robust: float | None = None, *, foreign: bool = True
+    ) -> tuple[Pose, Problem]:
         """Pose of a chunk of frames, its translation in the world, and the problem that it answers."""
         vertices, _ = without_gaps(frames.vertices, frames.weights, self.layer)
         terms, strength = self.terms, self.priors.temporal_strength
@@ -350,6 +368,7 @@ class PoseInversion(Derived):
         targets = Targets(
             vertices=vertices, identity=frames.identity, weights=frames.weights, terms=terms,
             bone_scale=frames.bone_scale, doubt=self.doubt, rest=frames.rest, robust=robust,
+            foreign=foreign,
         )  # fmt: skip
         return self.ladder(targets, None if frames.initial is None else frames.initial.pose())
 
