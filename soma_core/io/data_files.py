@@ -7,9 +7,11 @@ asked for. No class of a pickle is looked up and nothing in it is called.
 from __future__ import annotations
 
 import bz2
+import functools
 import gzip
 import io
 import lzma
+import math
 import mmap
 import zlib
 from collections.abc import Callable, Iterator
@@ -37,7 +39,7 @@ _SMALL, _MOST_EXPANSION = 256 * 2**20, 64
 _MOST_BYTES = 2**30
 _BLOCK = 2**20
 _FEW = 64
-"""Python objects in one array of an NPZ that are looked at; longer ones are labels and the like."""
+"""Python objects in one array of an NPZ that are looked at; longer ones are numbers, or labels."""
 
 _DEEPEST, _MOST_VALUES, _PLAIN = 5, 500_000, 32
 """Levels of lists that are an array, and arrays in the lists of a file: a part of 100,000 frames of five
@@ -130,8 +132,8 @@ class DataFile:
 
     def shape(self, value: Any) -> tuple[int, ...] | None:
         """Shape of a leaf, None where it is none; the numbers of an NPZ stay unread."""
-        if isinstance(value, _Member):
-            return value.header.shape if value.header else None
+        if isinstance(value, _Member) and value.header is not None:
+            return value.header.shape
         try:
             return self.array(value).shape
         except ValueError:
@@ -140,6 +142,10 @@ class DataFile:
     def _of_record(self, record: Record) -> np.ndarray:
         if is_tensor(record):
             return tensor_array(record)
+        if (objects := _objects_in(record)) is not None:
+            shape, values = objects
+            found = self._of_list(values, 1)
+            return found.reshape(*shape, *found.shape[1:])
         text = array_text(record)
         return self._records.array(record) if text is None else text
 
@@ -158,7 +164,9 @@ def open_data(path: str | Path) -> Iterator[DataFile]:
         yield DataFile(path, read_pose_frames(path))
     elif suffix == ".npz":
         with open_npz_file(path, fix="Give a complete .npz file.") as file:
-            yield DataFile(path, {name: _npz_value(file, name) for name in file.names})
+            found = DataFile(path, None)
+            found.content = {name: _npz_value(file, name, found) for name in file.names}
+            yield found
     elif suffix == ".npy":
         yield DataFile(path, _npy_value(path))
     elif suffix in (".pt", ".pth"):
@@ -167,7 +175,7 @@ def open_data(path: str | Path) -> Iterator[DataFile]:
         yield DataFile(path, _pickled(path))
 
 
-def _npz_value(file: NpzFile, name: str) -> Any:
+def _npz_value(file: NpzFile, name: str, found: DataFile) -> Any:
     """An array that is still unread, or what an array of a few Python objects holds."""
     try:
         header = file.header(name, objects=True)
@@ -179,7 +187,15 @@ def _npz_value(file: NpzFile, name: str) -> Any:
         return _Member(_refusing(f"Python objects, which {error}"))
     except ValueError as error:
         return _Member(_refusing(str(error)))
-    return _Member(_refusing("Python objects"))
+
+    @functools.cache
+    def read() -> np.ndarray:
+        try:
+            return found.array(run_motion_pickle(file.pickled(name)))
+        except RefusedPickleError as error:
+            raise ValueError(f"Python objects, which {error}") from error
+
+    return _Member(read)
 
 
 def _refusing(reason: str) -> Callable[[], np.ndarray]:
@@ -285,9 +301,16 @@ def _unpacked(path: Path, stream: IO[bytes] | io.RawIOBase) -> bytes:
 
 
 def _opened(value: Any) -> Any:
-    """What an array of Python objects holds: its one value, or a list of them."""
+    """What an array of Python objects holds: its one value, or a list of them; one of more axes stays."""
+    shape, items = _objects_in(value) or ((0, 0), [])
+    return value if len(shape) > 1 else items[0] if shape == () and len(items) == 1 else items
+
+
+def _objects_in(value: Any) -> tuple[tuple[int, ...], list[Any]] | None:
+    """Shape and entries of an array of Python objects; None for anything else."""
     state = value.state if isinstance(value, Record) else None
-    if isinstance(state, tuple) and len(state) >= 4 and isinstance(state[-1], list):
-        items = state[-1]
-        return items[0] if state[-4] == () and len(items) == 1 else items
-    return value
+    if not (isinstance(state, tuple) and len(state) >= 4 and isinstance(state[-1], list)):
+        return None
+    shape = state[-4]
+    sizes = isinstance(shape, tuple) and all(type(size) is int and size >= 0 for size in shape)
+    return (shape, state[-1]) if sizes and math.prod(shape) == len(state[-1]) else None

@@ -11,7 +11,7 @@ import numpy as np
 from soma_core.errors import InputError
 from soma_core.io.data_files import DataFile
 from soma_core.io.rotation_shapes import split_shape
-from soma_core.io.smpl_names import PARTS, RATES, Space, Tool, part_of, space_of, tool_of
+from soma_core.io.smpl_names import PARTS, RATES, Space, Tool, frame_number, part_of, space_of, tool_of
 
 __all__ = [
     "BODY_JOINTS", "POSE_JOINTS", "FoundBody", "choose_body", "find_bodies", "holds_poses",
@@ -150,10 +150,8 @@ class _Walk:
             yield from self._of_list(node, way, above)
         elif isinstance(node, dict):
             yield from self._of_names(node, way, above)
-        elif (
-            not way and (shape := self._file.shape(node)) is not None and len(shape) == 2 and shape[1] == 322
-        ):
-            yield 0, self._motion_x(node)
+        elif not way and (self._file.shape(node) or ())[-1:] == (322,):
+            yield from self._motion_x(node)
 
     def _of_list(self, node: Sequence[Any], way: tuple[str, ...], above: Mapping[str, Any]) -> Iterator[Any]:
         if not node or not all(isinstance(item, dict) for item in node):
@@ -165,16 +163,30 @@ class _Walk:
             for number, item in enumerate(node):
                 yield from self.bodies(item, (*way, str(number)), above)
 
-    def _is_frame(self, node: Mapping[Any, Any]) -> bool:
+    def _numbered(self, node: Mapping[Any, Any]) -> list[dict[Any, Any]]:
+        """Frames by their number or the name of their picture, in order; none of people or other things."""
+        number = {key: key if type(key) is int else frame_number(key) for key in node}
+        whole = len(node) > 1 and all(isinstance(value, dict) for value in node.values())
+        if not whole or None in number.values() or len(node) * len(next(iter(node.values()))) >= _MOST_SEEN:
+            return []
+        counted = all(type(key) is int for key in node)  # a row of one frame may be a person's
+        if not self._is_frame(next(iter(node.values())), leads=((),) if counted else ((), (1,))):
+            return []
+        return [{"frame_id": number[key]} | node[key] for key in sorted(node, key=lambda key: number[key])]
+
+    def _is_frame(self, node: Mapping[Any, Any], leads: Sequence[tuple[int, ...]] = ((), (1,))) -> bool:
         """Whether a body of a list is one frame, and the list their sequence."""
         poses = [(part, value) for (part, _), (_, value) in self._named(node, ()).items() if part in _JOINTS]
         shapes = [(self._file.shape(value), _JOINTS[part]) for part, value in poses]
         splits = [split_shape(shape, joints) for shape, joints in shapes if shape is not None]
-        return any(split is not None and split[0] in ((), (1,)) for split in splits)
+        return any(split is not None and split[0] in leads for split in splits)
 
     def _of_names(
         self, node: Mapping[Any, Any], way: tuple[str, ...], above: Mapping[str, Any]
     ) -> Iterator[Any]:
+        if frames := self._numbered(node):
+            yield from self._of_list(frames, way, above)
+            return
         tracks, tool = _tracks(node), tool_of({"tracks"})
         if not tracks:
             tracks, tool = self._images(node), tool_of({"smpl_thetas", "cam_trans"})
@@ -185,7 +197,9 @@ class _Walk:
         named = self._named(node, way)
         shared = dict(above) | {part: named[part, None] for part in _SHARED if (part, None) in named}
         names = {*way, *map(str, node)}
-        for space in dict.fromkeys(space for part, space in named if part in _JOINTS):
+        spaces = dict.fromkeys(space for part, space in named if part in _JOINTS)
+        paths = {space for part, space in named if part == "trans"}
+        for space in paths if spaces == {None: None} and len(paths) == 1 else spaces:
             parts = shared | {part: value for (part, other), value in named.items() if other in (space, None)}
             parts |= {part: value for (part, other), value in named.items() if other == space}
             for body in self._people(parts, way, space, names):
@@ -278,13 +292,16 @@ class _Walk:
             person = f"{body.person}/{index}".lstrip("/")
             yield replace(body, person=person, index=index, count=count)
 
-    def _motion_x(self, node: Any) -> FoundBody:
-        values, at, parts = self._file.array(node), 0, {}
+    def _motion_x(self, node: Any) -> Iterator[tuple[int, FoundBody]]:
+        array, at, parts = self._file.array(node), 0, {}
+        values = array.reshape(-1, 322)
+        if len(values) not in array.shape[:-1]:
+            return
         for part, width in _MOTION_X.items():
             parts[part] = f"columns {at} to {at + width}", values[:, at : at + width]
             at += width
         parts = {part: value for part, value in parts.items() if part in PARTS}
-        return FoundBody(person="", space=None, parts=parts, tool=tool_of({"motion_x_322"}))
+        yield 0, FoundBody(person="", space=None, parts=parts, tool=tool_of({"motion_x_322"}))
 
 
 def _tracks(node: Mapping[Any, Any]) -> dict[str, dict[str, tuple[str, Any]]]:

@@ -44,6 +44,9 @@ _VIDEO = 30.0
 _SAME_RATE = 2e-3
 """Relative difference of frame rates that are the same, as 29.97 and 30 are."""
 
+_OF_AMASS = {"trans", "mocap_framerate", "mocap_frame_rate"}
+"""Keys of files whose world has +z up, as AMASS has it."""
+
 _COUNTED, _LASTING = 1.5, 0.02
 """Frames, and share of them, that a duration may be off by: ends that were cut, rates that were rounded."""
 
@@ -382,9 +385,10 @@ class _Reading:
         if self._body.space == "camera" and self._camera is None:
             _log.info("%s: camera axes, +y down: turned upright; up= for another axis", self._file.path.name)
             return "-y"
-        if self._tool is None:
+        amass = {self._parts.key(part) for part in ("trans", *RATES) if part in self._parts} & _OF_AMASS
+        if self._tool is None and (amass or "trans" not in self._parts):
             return "+z"
-        if self._tool.up:
+        if self._tool and self._tool.up:
             return self._tool.up
         upward = Rotation.from_rotvec(rotations[:, 0]).apply([0, 1, 0]).mean(axis=0)
         axis = 1 + int(np.abs(upward[1:]).argmax())

@@ -6,11 +6,12 @@ is the body in the world. Layouts are those of the projects' own demos and data 
 
 from __future__ import annotations
 
+import re
 from collections.abc import Collection
 from dataclasses import dataclass
 from typing import Literal
 
-__all__ = ["PARTS", "RATES", "TOOLS", "Space", "Tool", "part_of", "space_of", "tool_of"]
+__all__ = ["PARTS", "RATES", "TOOLS", "Space", "Tool", "frame_number", "part_of", "space_of", "tool_of"]
 
 Space = Literal["world", "camera"]
 
@@ -61,6 +62,8 @@ _EXACT: dict[str, tuple[str, Space | None] | None] = {
 }  # fmt: skip
 """Names that the rules would take for something else; None for what is no part."""
 
+_HUMP = re.compile(r"(?<=[a-z])(?=[A-Z][a-z])")
+_FRAME_NAME = re.compile(r"(\d{3,9})|.*?(\d{1,9})\.(?:jpe?g|png|bmp|webp)", re.IGNORECASE)
 _PREFIXES = ("pred_", "smplx_", "smplh_", "smpl_", "opt_", "est_")
 _SPACES: dict[str, Space] = {
     "world": "world", "global": "world", "glob": "world", "w": "world",
@@ -71,6 +74,8 @@ _SPACES: dict[str, Space] = {
 def part_of(key: str) -> tuple[str, Space | None, int] | None:
     """Part that a key names, the space that its name tells, and its rank among the names of that part."""
     name, space = key.lower(), None
+    if name not in _PART_OF:
+        name = _HUMP.sub("_", key).lower()
     if name in _EXACT:
         found = _EXACT[name]
         return None if found is None else (*found, 0)
@@ -86,6 +91,12 @@ def part_of(key: str) -> tuple[str, Space | None, int] | None:
 def space_of(component: str) -> Space | None:
     """Space that a part of a path tells, as ``smplx_world`` does."""
     return next((_SPACES[word] for word in component.lower().split("_") if word in _SPACES), None)
+
+
+def frame_number(key: object) -> int | None:
+    """Number of a frame that is called by it or by its picture, as ``000012`` and ``img_12.png`` are."""
+    found = _FRAME_NAME.fullmatch(str(key))
+    return int(found[1] or found[2]) if found else None
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -115,6 +115,18 @@ def smplx_names(turns: np.ndarray, **others: Any) -> dict[str, Any]:
     } | others
 
 
+def rows(values: np.ndarray) -> np.ndarray:
+    """The same, each row an object of its own."""
+    found = np.empty(len(values), object)
+    found[:] = list(values)
+    return found
+
+
+def framed(content: dict[str, np.ndarray]) -> list[dict[str, np.ndarray]]:
+    """A dictionary a frame."""
+    return [{key: value[frame] for key, value in content.items()} for frame in range(FRAMES)]
+
+
 def phalp() -> dict[str, Any]:
     """Frames with the tracks seen in each; the second person comes and goes, and is once predicted only."""
     found = {}
@@ -436,9 +448,48 @@ LAYOUTS = [
         },
     ),
     Layout(
-        name="ROMP-like", suffix=".npz", save=save_npz, model="smpl", turns=SMPL, up="+z", fps=25,
+        name="ROMP-like", suffix=".npz", save=save_npz, model="smpl", turns=SMPL, fps=25,
         content=lambda: {
             "smpl_thetas": flat(SMPL), "root_translation": PATH, "smpl_betas": MANY, "gender": "n", "fps": 25,
         },
+    ),
+    Layout(
+        name="arrays of objects", suffix=".npz", save=save_npz, model="smplh", turns=SMPLH, up="+z", fps=60,
+        content=lambda: {
+            "poses": flat(SMPLH).astype(object), "trans": PATH.astype(object), "betas": BETAS.astype(object),
+            "gender": np.array(["neutral"], object), "mocap_framerate": 60.0,
+        },
+    ),
+    Layout(
+        name="rows that are objects", suffix=".npy", save=save_npy,
+        content=lambda: {"smplx": {key: rows(value) for key, value in smplx_names(TURNS).items()}},
+    ),
+    Layout(
+        name="frames by number", suffix=".pkl", save=save_pickle,
+        content=lambda: dict(reversed(list(enumerate(framed(smplx_names(TURNS)), start=3)))),
+    ),
+    Layout(
+        name="frames by picture", suffix=".npy", save=save_npy,
+        content=lambda: {
+            f"shot_{number:04}.jpg": frame for number, frame in enumerate(framed(smplx_names(TURNS)))
+        },
+    ),
+    Layout(
+        name="names with humps", suffix=".npz", save=save_npz, fps=25,
+        content=lambda: {
+            "globalOrient": TURNS[:, 0], "bodyPose": TURNS[:, 1:22], "transl": PATH, "betas": MANY,
+            "gender": "neutral", "fps": 25,
+        },
+    ),
+    Layout(
+        name="OSX", suffix=".npz", save=save_npz, fps=25, up="-y",
+        content=lambda: {
+            "smplx_root_pose": TURNS[:, 0], "smplx_body_pose": TURNS[:, 1:22], "smplx_shape": MANY,
+            "cam_trans": PATH, "gender": "neutral", "fps": 25,
+        },
+    ),
+    Layout(
+        name="Motion-X in a batch", suffix=".npy", save=save_npy, content=lambda: motion_x()[None],
+        turns=NO_EYES,
     ),
 ]  # fmt: skip
