@@ -276,12 +276,10 @@ class _Reading:
     def _gender(self) -> Gender:
         if self._choices.gender:
             own = self._parts.text("gender").lower() if "gender" in self._parts else ""
-            if _GENDERS.get(own, self._choices.gender) != self._choices.gender:
-                self._say(
-                    "gender=%s is taken in place of %s, whose betas are another body",
-                    self._choices.gender,
-                    own,
-                )
+            other = _GENDERS.get(own, self._choices.gender) != self._choices.gender
+            if other and self._choices.betas is None:
+                told = "gender=%s is taken in place of %s, whose betas are another body"
+                self._say(told, self._choices.gender, own)
             return self._choices.gender
         if "gender" in self._parts:
             name = self._parts.text("gender")

@@ -67,7 +67,7 @@ def carried(path: Path, layout: str, options: ConvertOptions) -> Retargeted:
         told = of_path(moved.translation, moved.fps, up="+y", what="its path")
         say(path.name, of_rate(moved.fps) + of_movement(moved, turns=("swap_sides",), told=told))
     elif not asked:
-        say(path.name, of_movement(found.motion, turns=("swap_sides", "rotation_layout"), path=False))
+        say(path.name, of_movement(found.motion, turns=("swap_sides", "rotation_layout")))
     found = refined(found) if options.refine == "joints" else found
     left = found.report["not_carried"]
     if left:

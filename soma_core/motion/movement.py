@@ -56,8 +56,8 @@ _SLIDES, _WALKS, _FITS, _NEAR = 0.15, 0.6, 0.5, 1.4
 """Least speed [m/s] by which feet slide, shares of the slide with the path left out and as it is that the
 right path leaves at most, and the least factor that is none of legs of another length."""
 
-_CLOSE_UNIT = 1.15
-"""Factor by which a unit may differ from what the feet walk."""
+_CLOSE_UNIT = 1.3
+"""Factor by which a unit may differ from what the feet walk, of a person with other legs."""
 
 _SMOOTH, _GRAVITY, _LEAST_GRAVITY = 0.1, 9.81, 5.0
 """Time [s] over which a push is measured, and what a body weighs [m/s^2]."""

@@ -326,7 +326,7 @@ def _skeletons() -> Iterator[tuple[str, bytes]]:
     yield "bvh of no frame", good
     yield "bvh of NaN", good + b"nan"
     yield "bvh of infinity", good + b"1e999"
-    yield "bvh of text", good + b"0 1,5"
+    yield "bvh of text", good + b"0 1,5 abc"
     yield "bvh of one long number", good + b"1" * 2_000_000
     yield "bvh of many channels", good.replace(b"1 Xrotation", b"1000000000 Xrotation") + b"0"
     yield "bvh of an unknown channel", good.replace(b"Xrotation", b"Wrotation") + b"0"

@@ -224,3 +224,22 @@ def test_sides_of_other_skeletons_are_exchanged(walk, rig, tmp_path):
         ]
         mend = "swap_sides=true" if name == "sides" else "rotation_layout=columns"
         assert any(mend in text for text in said) or name == "columns", said
+
+
+@pytest.mark.parametrize(("unit", "mend"), [(1, ""), (0.3048, "unit=ft")], ids=["metres", "feet"])
+def test_smpl_without_its_model_is_asked_how_it_walks(walk, unit, mend, tmp_path):
+    """Whose legs are not known: they may be a fifth shorter."""
+    poses = np.zeros((len(walk.translation), 52, 3))
+    joints = ("Leg", "Shin", "Foot", "Arm", "ForeArm")
+    for first, part in zip((1, 4, 7, 16, 18), joints, strict=True):
+        for smpl, side in ((first, "Left"), (first + 1, "Right")):
+            turns = walk.rotations[:, USER_JOINTS.index(side + part)]
+            poses[:, smpl] = Rotation.from_matrix(turns).as_rotvec()
+    poses[:, 0] = Rotation.from_euler("xz", [90, 90], degrees=True).as_rotvec()
+    path = 0.8 * walk.translation[:, [2, 0, 1]] / unit
+    kind = {"model": "smplh", "betas": np.zeros(10), "gender": "female", "fps": FPS}
+    write_amass(SmplMotion(rotations=poses, translation=path, **kind), tmp_path / "a.npz")
+    said = convert_file(tmp_path / "a.npz", tmp_path / "out", options=ConvertOptions(carry="skeleton"))
+    others = [text for text in said.report["warnings"] if "betas are not read" not in text]
+    assert len(others) == bool(mend), others
+    assert all(mend in text for text in others)
