@@ -165,9 +165,9 @@ class _Walk:
 
     def _numbered(self, node: Mapping[Any, Any]) -> list[dict[Any, Any]]:
         """Frames by their number or the name of their picture, in order; none of people or other things."""
-        number = {key: key if type(key) is int else frame_number(key) for key in node}
-        whole = len(node) > 1 and all(isinstance(value, dict) for value in node.values())
-        if not whole or None in number.values() or len(node) * len(next(iter(node.values()))) >= _MOST_SEEN:
+        number = {key: found for key in node if (found := frame_number(key)) is not None}
+        whole = len(number) > 1 and all(isinstance(value, dict) for value in node.values())
+        if not whole or len(number) < len(node) or len(node) * len(next(iter(node.values()))) >= _MOST_SEEN:
             return []
         counted = all(type(key) is int for key in node)  # a row of one frame may be a person's
         if not self._is_frame(next(iter(node.values())), leads=((),) if counted else ((), (1,))):

@@ -95,6 +95,8 @@ def space_of(component: str) -> Space | None:
 
 def frame_number(key: object) -> int | None:
     """Number of a frame that is called by it or by its picture, as ``000012`` and ``img_12.png`` are."""
+    if type(key) is int:
+        return key
     found = _FRAME_NAME.fullmatch(str(key))
     return int(found[1] or found[2]) if found else None
 
