@@ -51,6 +51,7 @@ def run_task(
     """
     register_schemas()
     register_search_path()
+    _check_one_folder(config_name, overrides)
     running: list[Path] = []
 
     def job(config: DictConfig) -> None:
@@ -81,6 +82,16 @@ def run_task(
             if running or error.filename is None:
                 raise
             raise _no_folder(error, config_name) from error
+
+
+def _check_one_folder(config_name: str, overrides: Sequence[str]) -> None:
+    """Refuse two folders for one run, of which hydra's would be taken in silence."""
+    given = dict(each.split("=", 1) for each in overrides if each.startswith(("out=", "hydra.run.dir=")))
+    if config_name == "convert" and len(given) > 1 and len({*given.values()}) > 1:
+        raise InputError(
+            "hydra.run.dir", got=f"{given['hydra.run.dir']} beside out={given['out']}",
+            expected="one folder of the results", fix="Leave hydra.run.dir out.",
+        )  # fmt: skip
 
 
 def _check_device(config: DictConfig) -> None:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from omegaconf import OmegaConf
 
-from soma_core.cli import EXIT_FAILED, EXIT_OK, main
+from soma_core.cli import EXIT_FAILED, EXIT_OK, EXIT_USAGE, main
 from soma_core.config.schema import ConvertConfig
 from soma_core.errors import InputError
 from soma_core.io import read_motion, write_motion
@@ -170,3 +170,10 @@ def test_shards_are_named_and_rows_of_clips_are_told_from_frames(tmp_path, monke
     assert "input: got 000000.parquet, a Parquet file of clips" in capsys.readouterr().err
     assert main(["convert", "input=m.npz", "engine=ray", "out=again"]) != EXIT_OK
     assert "engine: got ray, for one file" in capsys.readouterr().err
+
+
+def test_two_folders_for_one_run_are_refused(tmp_path, capsys):
+    command = ["convert", "input=walk.npz", f"out={tmp_path}/a", f"hydra.run.dir={tmp_path}/b"]
+    assert main(command) == EXIT_USAGE
+    assert f"hydra.run.dir: got {tmp_path}/b beside out={tmp_path}/a" in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
