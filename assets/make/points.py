@@ -110,17 +110,8 @@ def _face(marks: Landmarks) -> list[int]:
         marks, lips, ((0, 1), (0.25, 1), (0.5, 1), (0.75, 1), (1, 1), (0.75, -1), (0.5, -1), (0.25, -1))
     )
     outer = _outer_lips(marks, lips, mouth)
-    return [
-        *jaw,
-        *[marks.right(v) for v in brows[::-1]],
-        *brows,
-        *bridge,
-        *base,
-        *right,
-        *left,
-        *outer,
-        *inner,
-    ]
+    brows = [*(marks.right(v) for v in brows[::-1]), *brows]
+    return [*jaw, *brows, *bridge, *base, *right, *left, *outer, *inner]
 
 
 def _jaw(marks: Landmarks, mouth: np.ndarray) -> list[int]:
@@ -171,13 +162,8 @@ def _both(names: Mapping[str, str], order: Sequence[str] = ("left", "right")) ->
 
 
 _LIMBS = {
-    "shoulder": "Arm",
-    "elbow": "ForeArm",
-    "wrist": "Hand",
-    "hip": "Leg",
-    "knee": "Shin",
-    "ankle": "Foot",
-}
+    "shoulder": "Arm", "elbow": "ForeArm", "wrist": "Hand", "hip": "Leg", "knee": "Shin", "ankle": "Foot",
+}  # fmt: skip
 _LIMB_BONES = [
     [f"{side}_{a}", f"{side}_{b}"] for side in ("left", "right")
     for a, b in (("shoulder", "elbow"), ("elbow", "wrist"), ("hip", "knee"), ("knee", "ankle"))
@@ -185,11 +171,8 @@ _LIMB_BONES = [
 _TRUNK_BONES = [["left_shoulder", "right_shoulder"], ["left_hip", "right_hip"], ["left_shoulder", "left_hip"],
                 ["right_shoulder", "right_hip"]]  # fmt: skip
 _HEAD_BONES = [
-    ["nose", "left_eye"],
-    ["nose", "right_eye"],
-    ["left_eye", "left_ear"],
-    ["right_eye", "right_ear"],
-]
+    ["nose", "left_eye"], ["nose", "right_eye"], ["left_eye", "left_ear"], ["right_eye", "right_ear"],
+]  # fmt: skip
 
 
 def _skin_points(marks: Landmarks) -> dict[str, Place]:
@@ -290,6 +273,22 @@ def _h36m(skin: Mapping[str, Place]) -> dict[str, Place]:
     return points
 
 
+def _mediapipe33(skin: Mapping[str, Place], face: Sequence[int]) -> dict[str, Place]:
+    """The 33 landmarks of MediaPipe's body, which FreeMoCap keeps."""
+    points: dict[str, Place] = {"nose": skin["nose"]}
+    for side, inner, outer in (("left", 42, 45), ("right", 39, 36)):
+        points |= {f"{side}_eye_inner": _vertex(face[inner]), f"{side}_eye": skin[f"{side}_eye"],
+                   f"{side}_eye_outer": _vertex(face[outer])}  # fmt: skip
+    points |= {f"{side}_ear": skin[f"{side}_ear"] for side in ("left", "right")}
+    points |= {"mouth_left": _vertex(face[54]), "mouth_right": _vertex(face[48])}
+    points |= _both({part: _LIMBS[part] for part in ("shoulder", "elbow", "wrist")})
+    points |= _both({finger.lower(): f"Hand{finger}2" for finger in ("Pinky", "Index", "Thumb")})
+    points |= _both({part: _LIMBS[part] for part in ("hip", "knee", "ankle")})
+    for name, part in (("heel", "heel"), ("foot_index", "big_toe")):
+        points |= {f"{side}_{name}": skin[f"{side}_{part}"] for side in ("left", "right")}
+    return points
+
+
 def _mhr70(skin: Mapping[str, Place]) -> dict[str, Place]:
     """The 70 keypoints of MHR and SAM 3D Body: body, feet, fingers from tip to root, arms, neck."""
     body = _coco(skin)
@@ -377,6 +376,8 @@ def make_point_sets(folder: Path) -> list[Path]:
         "mhr70": ("The 70 keypoints of MHR and SAM 3D Body.", _mhr70(skin), coco_bones),
         "h36m17": ("The 17 joints of Human3.6M.", _h36m(skin), [["pelvis", "spine"], ["spine", "neck"],
                    ["neck", "nose"], ["nose", "head"], *_LIMB_BONES]),
+        "mediapipe33": ("The 33 landmarks of MediaPipe's body, which FreeMoCap keeps.",
+                        _mediapipe33(skin, face), coco_bones),
         "mano21-left": ("21 points of the left hand, in MediaPipe's order.", _hand("Left"), _hand_bones()),
         "mano21-right": ("21 points of the right hand, in MediaPipe's order.", _hand("Right"), _hand_bones()),
         "markers38": ("An example of a set of markers on the skin.", _markers(marks, skin), []),

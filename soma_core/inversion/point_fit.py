@@ -49,6 +49,9 @@ _STILL = 0.02
 _HIPS_PACE = 5.0
 """Usual acceleration of the Hips [m/s^2]."""
 
+_LASTING = 0.1
+"""A joint that is off what is expected stays so for a while [s]: frames within it are no more than one."""
+
 _ROUNDING = 1e-6
 """Relative to the matrix of the points: what is less is not told from nothing."""
 
@@ -181,7 +184,7 @@ class PointFit:
         found = bridged(replace(pose, translation=pose.translation + self.origin), self.valid)
         for _ in range(_ROUNDS):
             rows = rows_of(targets, self.weights, max(self.noise, _FIRST_NOISE))
-            found = PointRows(model, self.rest, rows, smooth=paces(model, fps))(found)
+            found = PointRows(model, self.rest, rows, smooth=paces(model, fps), share=_share(fps))(found)
             self.pose = replace(found, translation=found.translation - self.origin)
             if not self._trusted():
                 break
@@ -192,8 +195,9 @@ class PointFit:
     def lowered(self, points: Tensor, fps: float | None) -> PointRows:
         """What the fit lowers, of points (F, P, 3) [m] in the world, with the weights that it came to."""
         rows = rows_of(points - self.shift, self.weights, max(self.noise, _FIRST_NOISE))
-        smooth = None if fps is None or len(points) < 3 else paces(self.model, fps)
-        return PointRows(self.model, self.rest, rows, smooth=smooth)
+        if fps is None or len(points) < 3:
+            return PointRows(self.model, self.rest, rows, smooth=None)
+        return PointRows(self.model, self.rest, rows, smooth=paces(self.model, fps), share=_share(fps))
 
     def _sampled(self) -> PointFit:
         """A fit of some of the frames, evenly spaced, in which points have their way."""
@@ -333,6 +337,11 @@ def paces(model: PointModel, fps: float) -> Tensor:
     """Usual second differences (n + 1,) of the variables' turns [rad] and of the Hips [m]."""
     pace = torch.cat((model.pace[model.solver.variables], model.pace.new_tensor([_HIPS_PACE])))
     return pace / fps**2
+
+
+def _share(fps: float) -> float:
+    """What one frame of a motion adds to what is known of joints, beside a frame of its own."""
+    return min(1.0, 1.0 / (_LASTING * fps))
 
 
 def trusted(misses: Tensor, noise: float) -> Tensor:

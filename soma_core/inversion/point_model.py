@@ -63,6 +63,7 @@ class PointModel(torch.nn.Module):
         mean: (J, 3, 3) where a pose is expected.
         spread: (J,) root mean square angle [degrees] that each joint is expected to be off by.
         pull: (J, 3, 3) how strongly it is, as ``JointPrior.of`` says [1/rad^2].
+        hinged: (J,) whether a joint is a hinge.
         pace: (J,) usual angular accelerations [rad/s^2].
         prior: (p, 4, 4) moments of the prior, of the solver's pairs [1/rad^2].
     """
@@ -71,6 +72,7 @@ class PointModel(torch.nn.Module):
     hold: Tensor
     mean: Tensor
     pull: Tensor
+    hinged: Tensor
     pace: Tensor
     spread: Tensor
 
@@ -106,10 +108,12 @@ class PointModel(torch.nn.Module):
             "parents": np.maximum(parents, 0), "weighted": structure.joints,
             "spread": _spread(blocks), "pull": blocks, "pace": prior.paces(rig.joint_names),
             "hold": _HELD * _hold(structure.pairs),
+            "hinged": np.isin(np.arange(rig.joint_count), list(prior.hinges(rig.joint_names))),
         }  # fmt: skip
         for key, array in keep.items():
             tensor = torch.as_tensor(np.ascontiguousarray(array), device=layer.device)
-            tensor = tensor.to(layer.dtype) if tensor.is_floating_point() else tensor.long()
+            if tensor.dtype != torch.bool:
+                tensor = tensor.to(layer.dtype) if tensor.is_floating_point() else tensor.long()
             self.register_buffer(key, tensor, persistent=False)
         self.first, self.second = (
             torch.as_tensor(side.copy(), device=layer.device) for side in structure.pairs.T

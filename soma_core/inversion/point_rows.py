@@ -57,15 +57,20 @@ class PointRows:
             noise, and their derivatives (f, P, k, 3) by the points.
         smooth: standard deviations (n + 1,) of second differences: of turns [rad] and of the Hips [m];
             None for frames that are apart.
+        share: of what is known of joints, but for hinges, that one frame adds to the others.
     """
 
-    def __init__(self, model: PointModel, rest: PointRest, rows: Rows, *, smooth: Tensor | None) -> None:
+    def __init__(
+        self, model: PointModel, rest: PointRest, rows: Rows, *, smooth: Tensor | None, share: float = 1.0
+    ) -> None:
         self.model, self.rest, self.rows, self.smooth = model, rest, rows, smooth
         variables = model.solver.variables
         above = torch.as_tensor(model.structure.ancestors, device=variables.device)
         self.below = above[variables][:, model.weighted].to(model.mean)  # (n, T)
         self.variables, self.above = variables, model.parents[variables]
         self.size = 3 * len(variables) + 3
+        share_of_each = torch.where(model.hinged, 1.0, share)[:, None, None]
+        self.pull = (share_of_each * model.pull)[variables]
 
     def __call__(self, pose: Pose) -> Pose:
         """The pose of least energy near a pose of all frames."""
@@ -199,7 +204,7 @@ class PointRows:
     def _expected(self, pose: Pose, matrix: Tensor, slope: Tensor) -> Tensor:
         """Energy (F,) of what is known of the joints; its matrix and slope are added."""
         own, rest = pose.relative[:, self.variables], self.model.mean[self.variables]
-        pull = self.model.pull[self.variables]
+        pull = self.pull
         turned = own @ pull
         crossed = turned @ rest.mT
         trace = pull.diagonal(dim1=-2, dim2=-1).sum(-1)

@@ -13,6 +13,7 @@ import numpy as np
 
 from soma_core.errors import InputError
 from soma_core.io.data_files import open_data
+from soma_core.io.humanml3d import joints_of_humanml3d
 from soma_core.io.json_frames import frame_files
 from soma_core.json_file import read_json
 
@@ -33,6 +34,9 @@ _IDS = ("id", "track_id", "idx", "person_id")
 
 _SKIPPED = 4
 """Images have numbers this much further apart than they are many: those of a data set, which skip none."""
+
+_LONGER = {33: (75, 543, 553)}
+"""Points that begin with a set: MediaPipe's body, before its hands and faces, as FreeMoCap keeps them."""
 
 _FLAT = 263
 """Numbers a frame of HumanML3D's vectors."""
@@ -163,7 +167,7 @@ def _shaped(
     values = values.astype(np.float64)
     if values.ndim == 2 and values.shape[1] == _FLAT and size == 3:
         return PointFrames(
-            positions=_of_humanml3d(path, values), fps=fps or 20.0, layout="HumanML3D's vectors"
+            positions=joints_of_humanml3d(path, values), fps=fps or 20.0, layout="HumanML3D's vectors"
         )
     if values.ndim == 2 and values.shape[1] in (size, size + 1):
         values = values[None]
@@ -181,45 +185,25 @@ def _shaped(
 def _no_points(path: Path, shape: object, kind: object, size: int, views: int = 1) -> InputError:
     flat = isinstance(shape, tuple) and len(shape) >= 3 and shape[-1] == 2
     expected = "(frames, points, 3), with a confidence (frames, points, 4), or (frames, 263) of HumanML3D"
-    fix = "Save them as an array of that shape."
+    fix, got = "Save them as an array of that shape.", f"{shape} of {kind}"
     if size == 2:
         many = f"{views}, " if views > 1 else ""
         expected = f"({many}frames, points, 2) of pixels, with a confidence ({many}frames, points, 3)"
         fix = "Leave out camera for points in space, and give a list of cameras for several views."
     elif flat:
         fix = "Those of a picture need the camera that took it: camera=FILE.json."
-    return InputError(str(path), got=f"{shape} of {kind}", expected=expected, fix=fix)
-
-
-def _of_humanml3d(path: Path, data: np.ndarray) -> np.ndarray:
-    """Joints (F, 22, 3) [m] of HumanML3D's vectors: +Y up, from the origin, facing +Z at first."""
-    turn = np.concatenate(([0.0], np.cumsum(data[:-1, 0])))  # half the angle about the vertical
-    cosine, sine = np.cos(2 * turn), np.sin(2 * turn)
-
-    def back(vectors: np.ndarray) -> np.ndarray:
-        c, s = (one.reshape(-1, *[1] * (vectors.ndim - 2)) for one in (cosine, sine))
-        x, y, z = vectors[..., 0], vectors[..., 1], vectors[..., 2]
-        return np.stack((c * x - s * z, y, s * x + c * z), -1)
-
-    step = np.zeros((len(data), 3))
-    step[1:, 0], step[1:, 2] = data[:-1, 1], data[:-1, 2]
-    root = np.cumsum(back(step), axis=0)
-    root[:, 1] = data[:, 3]
-    joints = back(data[:, 4:67].reshape(len(data), 21, 3))
-    joints[..., [0, 2]] += root[:, None, [0, 2]]
-    height = float(np.median(data[:, 3]))
-    if not 0.05 < abs(height) < 3:
-        raise InputError(
-            str(path), got=f"a median height of {height:.3g} in the fourth number",
-            expected="HumanML3D's vectors in metres", fix="Undo the normalisation first: data * std + mean.",
-        )  # fmt: skip
-    return np.concatenate((root[:, None], joints), 1)
+        got = "points in a picture" if kind == "JSON" else got
+    return InputError(str(path), got=got, expected=expected, fix=fix)
 
 
 def _of_table(path: Path, size: int) -> PointFrames:
-    """A CSV: a row a frame, a column for each axis of a point; with names in its head, or without a head."""
+    """A table with commas, semicolons or tabs: a row a frame, a column for each axis of a point."""
     with open(path, newline="", encoding="utf-8-sig") as stream:
-        rows = [row for row in csv.reader(stream) if any(cell.strip() for cell in row)]
+        lines = stream.read().splitlines()
+    between = max(",;\t", key=lines[0].count) if lines else ","
+    rows = [row for row in csv.reader(lines, delimiter=between) if any(cell.strip() for cell in row)]
+    if between != ",":  # where a comma may be that of decimals
+        rows = [[cell.replace(",", ".") for cell in row] for row in rows]
     if not rows:
         raise InputError(str(path), got="an empty table", expected="a row a frame", fix="Write it again.")
     head = None if _numbers(rows[0]) is not None else [cell.strip() for cell in rows.pop(0)]
@@ -252,12 +236,7 @@ def _numbers(cells: Sequence[str]) -> list[float] | None:
 
 
 def _cells(path: Path, number: int, row: Sequence[str], count: int) -> list[float]:
-    found = []
-    for cell in row:
-        try:
-            found.append(float(cell) if cell.strip() else np.nan)
-        except ValueError:
-            found.append(np.nan)
+    found = [(_numbers([cell]) or [np.nan])[0] for cell in row]
     if len(found) != count:
         raise InputError(
             f"{path}, row {number}", got=f"{len(found)} cells", expected=f"{count}, as in the first",
@@ -270,8 +249,26 @@ def _of_folder(path: Path, person: str | None, size: int) -> PointFrames:
     """A folder of OpenPose or EasyMocap: a JSON file a frame, by the order of their names."""
     if not (files := frame_files(path)):
         raise InputError(str(path), got="no .json in it", expected="a file a frame", fix="Name their folder.")
-    frames = [_person(file, read_json(file, fix="Write it again."), person, size) for file in files]
+    frames = [
+        None if file is None else _person(file, read_json(file, fix="Write it again."), person, size)
+        for file in _with_gaps(files)
+    ]
     return _stacked(path, frames, "a folder with a file a frame", size)
+
+
+def _with_gaps(files: Sequence[Path]) -> list[Path | None]:
+    """Files by the one number that differs in their names; None where a number is skipped now and then."""
+    groups = [re.findall(r"\d+", file.stem) for file in files]
+    if len({len(group) for group in groups}) > 1:
+        return list(files)
+    differ = [column for column in zip(*groups, strict=True) if len(set(column)) > 1]
+    if len(differ) != 1:
+        return list(files)
+    found = {int(number): file for number, file in zip(differ[0], files, strict=True)}
+    first, last, step = min(found), max(found), int(np.gcd.reduce(np.diff(sorted(found))))
+    if len(found) < len(files) or last - first >= _SKIPPED * step * len(files):
+        return list(files)
+    return [found.get(number) for number in range(first, last + 1, step)]
 
 
 def _of_json(path: Path, person: str | None, size: int) -> PointFrames:
@@ -377,6 +374,9 @@ def _ordered(path: Path, found: PointFrames, names: Sequence[str]) -> PointFrame
         gone = ~(confidence > 0)
         positions = np.where(gone[..., None], np.nan, positions)
         confidence = np.where(gone, 0.0, confidence)
+    if found.names is None and positions.shape[1] in _LONGER.get(len(names), ()):
+        positions = positions[:, : len(names)]
+        confidence = confidence if confidence is None else confidence[:, : len(names)]
     if found.names is None and positions.shape[1] == len(names):
         return replace(found, positions=positions, confidence=confidence)
     row = {_plain(name): place for place, name in enumerate(found.names or ())}

@@ -182,18 +182,19 @@ def standing(track: FootTrack, motion: Motion) -> tuple[np.ndarray, float]:
     return held, floor
 
 
-def contacts_of(track: FootTrack, motion: Motion, floor: float) -> np.ndarray:
+def contacts_of(track: FootTrack, motion: Motion, floor: float, *, slow: float = SLOW) -> np.ndarray:
     """Which heels and toes stand (frames, 4): as the file says where they do not run, else the low and slow.
 
     Args:
         track: the feet of the motion.
         motion: with its frame rate.
         floor: its height [m].
+        slow: what is slow, in heights of the body a second.
     """
     speeds = _speeds(track.joints, motion.fps) / (SLOW * track.height)
     if motion.contacts is not None:
         return motion.contacts & (speeds < _SLIDING)
-    found = ((speeds < 1) & (track.soles < floor + LOW * track.height)).astype(np.int8)
+    found = ((speeds < slow / SLOW) & (track.soles < floor + LOW * track.height)).astype(np.int8)
     size = 2 * round(_STEADY_SECONDS * motion.fps / 2 - 0.25) + 1
     for first, second in ((maximum_filter1d, minimum_filter1d), (minimum_filter1d, maximum_filter1d)):
         found = second(first(found, size, axis=0, mode="nearest"), size, axis=0, mode="nearest")

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import logging
+import re
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -18,7 +20,7 @@ from soma_core.io.motion import Motion
 from soma_core.io.point_files import PointFrames, read_points
 from soma_core.motion.identities import kept_identity
 from soma_core.motion.models import open_layer, under
-from soma_core.motion.options import SIGNED, FitOptions
+from soma_core.motion.options import SIGNED, ConvertOptions, FitOptions
 from soma_core.motion.posed_input import world_axes
 from soma_core.motion.questions import Names, of_motion, of_rate, say
 from soma_core.options import IdentityChoice
@@ -35,6 +37,9 @@ _log = logging.getLogger(__name__)
 
 _SIZES = (0.6, 1.5)
 """A person this much smaller or larger than the body is said; a newborn has 0.3 of an adult."""
+
+_EXCHANGED, _TRIED = 5e-3, 24
+"""Sides are doubted where points miss by more [m], and tried on so many frames."""
 
 _LEAST_FRAMES = 60
 """A body is found from so many frames of points, or more: each tells little."""
@@ -74,7 +79,13 @@ def from_points(path: Path, options: FitOptions, *, person: str | None = None) -
     name = options.backend.name if options.backend is not None else "soma"
     given = dict(options.backend.options) if options.backend is not None else {}
     layer = open_layer(options, name, given)
+    found = _without_zeros(path, found)
     places, scale = _in_metres(path, found, options)
+    order = _other_sides(points.names)
+    if isinstance(options, ConvertOptions) and options.swap_sides:
+        places = places[..., order, :]
+        confidence = None if found.confidence is None else found.confidence[..., order]
+        found = replace(found, confidence=confidence)
     inversion = PointInversion(layer, points)
     weights = None if found.confidence is None else torch.as_tensor(found.confidence).to(places)
     try:
@@ -99,7 +110,10 @@ def from_points(path: Path, options: FitOptions, *, person: str | None = None) -
     )  # fmt: skip
     names = Names(ups=tuple(SIGNED) if options.upward is None else ())
     extent = None if not cameras else _extent(found.positions)
-    say(path.name, [*of_motion(motion, names), *_doubts(result, lengths, extent)])
+    doubts = _doubts(result, lengths, extent)
+    if not cameras:
+        doubts += _exchanged(inversion, places[:, order], identity, lengths, result)
+    say(path.name, [*of_motion(motion, names), *doubts])
     report = {"identity": kept or None, **_report(points.name, found, result, lengths, motion)}
     noise = f"{1e3 * result.noise:.1f} mm" if extent is None else f"{result.noise:.1f} px"
     _log.info(
@@ -215,7 +229,8 @@ def _doubts(result: PointResult, lengths: torch.Tensor | None, extent: float | N
     told, size = [], 1.0 if lengths is None else float(lengths.mean())
     if not _SIZES[0] < size < _SIZES[1]:
         told.append(
-            f"the person is {size:.2g} times the body's size; pass unit=m, cm or mm if that is not so"
+            f"the person is {size:.2g} times the body's size; "
+            "pass unit=m, cm, mm, inch or ft if that is not so"
         )
     gone = int((~result.valid).sum())
     if gone:
@@ -228,6 +243,49 @@ def _doubts(result: PointResult, lengths: torch.Tensor | None, extent: float | N
             + ("" if extent is None else "; are fx, fy, cx, cy and extrinsics those of the picture?")
         )
     return told
+
+
+def _without_zeros(path: Path, found: PointFrames) -> PointFrames:
+    """Points without those together at exactly zero in a frame, as many programs write unknown ones."""
+    zero = (found.positions == 0).all(-1)
+    zero &= zero.sum(-1, keepdims=True) > 1
+    if not zero.any() or zero.all():
+        return found
+    say(path.name, [f"{int(zero.sum())} points at exactly zero, beside others there, are taken as not known"])
+    return replace(found, positions=np.where(zero[..., None], np.nan, found.positions))
+
+
+def _other_sides(names: Sequence[str]) -> list[int]:
+    """For each point the place of that of the other side, by their names; its own where there is none."""
+    row = {name.lower(): place for place, name in enumerate(names)}
+    other = {"left": "right", "right": "left", "l": "r", "r": "l"}
+    found = []
+    for place, name in enumerate(map(str.lower, names)):
+        swapped = re.sub("left|right", lambda side: other[side[0]], name)
+        short = other.get(name[0], name[0]) + name[1:]
+        found.append(row.get(swapped if swapped != name else short, place))
+    return found
+
+
+def _exchanged(
+    inversion: PointInversion,
+    other: torch.Tensor,
+    identity: Identity,
+    lengths: torch.Tensor | None,
+    result: PointResult,
+) -> list[str]:
+    """Whether points fit far better as those of the other side (F, P, 3)."""
+    missed = float(result.residual.nanmedian())
+    if not missed > _EXCHANGED:
+        return []
+    some = torch.linspace(0, len(other) - 1, min(len(other), _TRIED)).round().long()
+    again = float(inversion(other[some], identity, bone_scale=lengths).residual.nanmedian())
+    if not again < 0.5 * missed:
+        return []
+    return [
+        f"points miss the body by {1e3 * missed:.0f} mm, and by {1e3 * again:.0f} mm if left is right; pass "
+        "swap_sides=true, or the axes are those of a left hand"
+    ]
 
 
 def _report(

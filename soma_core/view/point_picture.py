@@ -42,8 +42,8 @@ def point_picture(
 ) -> None:
     """Write a PNG of a body from the front with points on it, those behind its skin too.
 
-    Where many lie on the head or the left hand, a panel shows it from near. A panel of many points has their
-    numbers, in the order of the set from 0, instead of their names.
+    Where many lie on the head or a hand, the left if both, a panel shows it from near. A panel of many points
+    has their numbers, in the order of the set from 0, instead of their names.
 
     Args:
         path: the PNG.
@@ -73,7 +73,9 @@ def _panels(body: Body, places: np.ndarray) -> list[_Panel]:
     everywhere = np.arange(len(places))
     found = []
     head = places[:, 1] > high[1] - 0.16 * (high[1] - low[1])
-    hand = places[:, 0] > high[0] - 0.13 * (high[0] - low[0])
+    reach = 0.13 * (high[0] - low[0])
+    left, right = places[:, 0] > high[0] - reach, places[:, 0] < low[0] + reach
+    hand = left if left.sum() >= _CROWDED else right
     near = [np.flatnonzero(part) for part in (head, hand) if part.sum() >= _CROWDED]
     rest = np.setdiff1d(everywhere, np.concatenate([*near, everywhere[:0]]))
     if len(rest):

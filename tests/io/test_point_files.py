@@ -10,6 +10,7 @@ import pytest
 
 from soma_core.errors import InputError
 from soma_core.io.point_files import read_points
+from soma_core.points.point_set import load_point_set
 
 NAMES = ("nose", "left_hip", "right_hip")
 POINTS = np.random.default_rng(0).normal(size=(4, 3, 3))
@@ -51,6 +52,27 @@ def test_tables_by_name_and_without_a_head(tmp_path: Path) -> None:
     _same(read_points(tmp_path / "a.csv", NAMES).positions, known)
     np.savetxt(tmp_path / "b.csv", POINTS.reshape(4, -1), delimiter=",")
     _same(read_points(tmp_path / "b.csv", NAMES).positions)
+    for between in ("\t", ";"):
+        lines = [between.join(f"{value:.12f}".replace(".", ",") for value in row) for row in rows]
+        (tmp_path / "c.csv").write_text("\n".join([head.replace(",", between), *lines]))
+        _same(read_points(tmp_path / "c.csv", NAMES).positions, known)
+
+
+def test_numbers_that_a_folder_skips_are_frames_of_nobody(tmp_path: Path) -> None:
+    for number, frame in zip((0, 2, 8, 10), POINTS, strict=True):
+        content = [{"id": 0, "keypoints3d": frame.tolist()}]
+        (tmp_path / f"clip3_{number:06d}_keypoints.json").write_text(json.dumps(content))
+    found = read_points(tmp_path, NAMES).positions
+    assert len(found) == 6
+    _same(found[[0, 1, 4, 5]])
+    assert np.isnan(found[[2, 3]]).all()
+
+
+def test_a_body_comes_before_its_hands_and_face(tmp_path: Path) -> None:
+    whole = np.random.default_rng(1).normal(size=(2, 553, 3))
+    np.save(tmp_path / "a.npy", whole)
+    names = load_point_set("mediapipe33").names
+    _same(read_points(tmp_path / "a.npy", names).positions, whole[:, :33])
 
 
 def test_json_of_keypoint_tools(tmp_path: Path) -> None:

@@ -1,6 +1,8 @@
 """Cleaned motions: spikes go, smooth motions stay, nothing lags, and the mirror image is one."""
 
+import os
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -15,6 +17,7 @@ from soma_core.motion import (
     CleanOptions,
     LimbSeconds,
     clean,
+    load_clip,
     mirror,
     mirrored_body,
     motion_quality,
@@ -289,6 +292,17 @@ def test_the_report_tells_sliding_feet_and_joints_beyond_their_range():
     found = motion_quality(replace(still, rotations=rotations))["joint_range"]
     assert found["LeftShin"]["share"] == 0.5
     assert "RightShin" not in found
+
+
+@pytest.mark.parametrize("name", ["01_single_text_prompt", "03_full_body_keyframes", "06_root_waypoints"])
+def test_feet_slide_alike_whether_the_file_says_when_they_stand(name):
+    file = Path(os.environ.get("SOMA_TEST_DATA", "")) / "motions" / f"kimodo_{name}.npz"
+    if not file.is_file():
+        pytest.skip(f"needs SOMA_TEST_DATA with {file}")
+    motion = load_clip(file)
+    told, found = motion_quality(motion), motion_quality(replace(motion, contacts=None))
+    assert found["foot_slide_mm_s"] == pytest.approx(told["foot_slide_mm_s"], rel=0.25)
+    assert found["foot_contacts"] == pytest.approx(told["foot_contacts"], abs=0.08)
 
 
 def test_absolute_rotations_are_read_as_such():

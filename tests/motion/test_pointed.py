@@ -22,6 +22,7 @@ from soma_core.motion import (
     invert,
     load_clip,
 )
+from soma_core.points.point_set import load_point_set
 
 LAYER = SomaLayer("soma", lod="low")
 CLIP = load_clip().cut(slice(0, 24))
@@ -60,6 +61,31 @@ def test_units_and_axes_are_told_or_questioned(tmp_path: Path) -> None:
     found, again = _run(tmp_path, upright, up="z")
     assert not found.report["warnings"]
     assert np.linalg.norm(again - POINTS, axis=-1).mean() < 1e-3
+
+
+def test_exchanged_sides_are_told_and_mended(tmp_path: Path) -> None:
+    names = load_point_set("smpl22").names
+    other = [
+        names.index(name.replace("left", "#").replace("right", "left").replace("#", "right"))
+        for name in names
+    ]
+    for wrong in (POINTS[:, other], POINTS * [-1, 1, 1]):
+        found, _ = _run(tmp_path, wrong)
+        assert any("swap_sides=true" in one for one in found.report["warnings"])
+        found, _ = _run(tmp_path, wrong, swap_sides=True)
+        assert not found.report["warnings"]
+        assert found.error_mm is not None
+        assert found.error_mm["mean"] < 1
+    found, _ = _run(tmp_path, POINTS + 0.01 * np.random.default_rng(0).normal(size=POINTS.shape))
+    assert not any("swap_sides" in one for one in found.report["warnings"])
+
+
+def test_points_at_zero_are_not_known(tmp_path: Path) -> None:
+    zeros = POINTS.copy()
+    zeros[10:12], zeros[3, 5:7] = 0, 0
+    found, again = _run(tmp_path, zeros)
+    assert any("46 points at exactly zero" in one for one in found.report["warnings"])
+    assert np.abs(again - POINTS).max() < 0.02
 
 
 def test_another_person_keeps_the_lengths_of_the_points(tmp_path: Path) -> None:
