@@ -69,7 +69,7 @@ def from_points(path: Path, options: FitOptions, *, person: str | None = None) -
     assert options.points is not None
     points = load_point_set(options.points)
     cameras = () if options.camera is None else _cameras(options)
-    found = read_points(path, points.names, person=person, views=len(cameras))
+    found = _without_zeros(path, read_points(path, points.names, person=person, views=len(cameras)))
     fps = options.fps or found.fps
     if fps is None:
         raise InputError(
@@ -79,13 +79,11 @@ def from_points(path: Path, options: FitOptions, *, person: str | None = None) -
     name = options.backend.name if options.backend is not None else "soma"
     given = dict(options.backend.options) if options.backend is not None else {}
     layer = open_layer(options, name, given)
-    found = _without_zeros(path, found)
     places, scale = _in_metres(path, found, options)
     order = _other_sides(points.names)
     if isinstance(options, ConvertOptions) and options.swap_sides:
-        places = places[..., order, :]
-        confidence = None if found.confidence is None else found.confidence[..., order]
-        found = replace(found, confidence=confidence)
+        places, sure = places[..., order, :], found.confidence
+        found = replace(found, confidence=None if sure is None else sure[..., order])
     inversion = PointInversion(layer, points)
     weights = None if found.confidence is None else torch.as_tensor(found.confidence).to(places)
     try:
