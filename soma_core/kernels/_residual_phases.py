@@ -128,11 +128,21 @@ _RESIDUAL = """
             for (int i = 0; i < 3; i++) r[i] = back[i] = V{};
             continue;
         }
-        BLEND
-        V d[3], share = own ? *o : V{} + weight.data[v];
-        for (int i = 0; i < 3; i++) {
-            const V* row = m + 4 * i;
-            d[i] = row[0] * x[0] + row[1] * x[1] + row[2] * x[2] + row[3] - (y[i] - origin[i]);
+        V m[9], d[3], share = own ? *o : V{} + weight.data[v];
+        for (int i = 0; i < 3; i++) {  // row by row, which narrow processors have registers for
+            V a = V{}, b = V{}, c = V{}, s = V{};
+            for (int e = start.data[v]; e < start.data[v + 1]; e++) {
+                M t = transform + 12 * joint.data[e] + 4 * i;
+                const R w = value.data[e];
+                a += w * t[0];
+                b += w * t[1];
+                c += w * t[2];
+                s += w * t[3];
+            }
+            m[3 * i] = a;
+            m[3 * i + 1] = b;
+            m[3 * i + 2] = c;
+            d[i] = a * x[0] + b * x[1] + c * x[2] + s - (y[i] - origin[i]);
         }
         if (measured) *length = ROOT(d[0] * d[0] + d[1] * d[1] + d[2] * d[2]);
         for (int i = 0; i < 3; i++) d[i] = share > 0 ? d[i] : zero;
@@ -147,7 +157,7 @@ _RESIDUAL = """
         for (int i = 0; i < 3; i++) d[i] *= share;
         for (int i = 0; i < 3; i++) {
             r[i] = d[i];
-            back[i] = scale * (m[i] * d[0] + m[4 + i] * d[1] + m[8 + i] * d[2]);
+            back[i] = scale * (m[i] * d[0] + m[3 + i] * d[1] + m[6 + i] * d[2]);
         }
     }
     *@ENERGY += energy;
@@ -167,17 +177,16 @@ _PULL = """
 _FORCES = """
     M x = @POINT, r = @PULLED;
     for (int p = run.data[t]; p < run.data[end]; p++) {
-        V f[12];
-        for (int k = 0; k < 12; k++) f[k] = V{};
-        for (int q = start.data[p]; q < start.data[p + 1]; q++) {
-            const int u = 3 * row.data[q];
-            for (int i = 0; i < 3; i++) {
+        for (int i = 0; i < 3; i++) {
+            V f[4] = {V{}, V{}, V{}, V{}};
+            for (int q = start.data[p]; q < start.data[p + 1]; q++) {
+                const int u = 3 * row.data[q];
                 const V a = value.data[q] * r[u + i];
-                for (int k = 0; k < 3; k++) f[4 * i + k] += a * x[u + k];
-                f[4 * i + 3] += a;
+                for (int k = 0; k < 3; k++) f[k] += a * x[u + k];
+                f[3] += a;
             }
+            M to = (M)out.data + 12 * joint.data[p] + 4 * i;
+            for (int k = 0; k < 4; k++) to[k] += f[k];
         }
-        M to = (M)out.data + 12 * joint.data[p];
-        for (int k = 0; k < 12; k++) to[k] += f[k];
     }
 """
