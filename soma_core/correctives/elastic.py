@@ -12,6 +12,7 @@ from torch import Tensor
 
 from soma_core.cache import content_key
 from soma_core.correctives.bind_body import BindBody
+from soma_core.correctives.bones import Bones
 from soma_core.correctives.frames import SurfaceFrames, diffused
 from soma_core.correctives.masks import find_creases, geodesic_falloff
 from soma_core.correctives.sections import Sections
@@ -34,6 +35,12 @@ _HELD_FROM = 0.7
 _REACH = 1.5
 """How far a section around a joint goes along the surface, in thicknesses of the limb."""
 
+_BONE = 6.0
+"""Pull of bone on the skin over it, on the same scale."""
+
+_SPREAD = 0.2
+"""Of the flesh: below this share of a section pressure is not evened out, or its end would bulge."""
+
 _VERSION = 1  # raise when the surface comes out differently
 
 _VOLUME_STEPS = 6
@@ -46,12 +53,15 @@ class ElasticSurface:
     Minimises ``sum_ij |(x_i - x_j) - (R_i + R_j)/2 (u_i - u_j)|^2 + sum_i a_i |x_i - y_i|^2`` subject to the
     volume of a section around every joint being that of the bind pose: y are skinned vertices, R their
     smooth local rotations (Direct Delta Mush: Le and Lewis 2019), a is large where skin follows one bone.
+    With `bones` y goes around the joint on an arc in front of knees and elbows, and no pressure acts there:
+    what the fold displaces goes to the flesh of calf and thigh, forearm and upper arm (see :class:`Bones`).
     The rotations are known, so that the energy is quadratic with one matrix for all poses; the volumes are
     kept by one pressure each, found by Newton steps with the response of the bind pose.
 
     Args:
         mesh, rig: the canonical body; twist joints take part where the rig has any.
         identity: another body than the canonical one, of batch 1.
+        bones: there is bone under the skin of knees and elbows.
         kernels: of the frames, see :class:`SurfaceFrames`.
     """
 
@@ -63,6 +73,7 @@ class ElasticSurface:
         rig: Rig,
         *,
         identity: Identity | None = None,
+        bones: bool = False,
         kernels: Literal["auto", "torch", "warp"] = "auto",
     ) -> None:
         self.body = BindBody(rig, identity)
@@ -75,16 +86,24 @@ class ElasticSurface:
         )
         neighbours = adjacency(edges, len(points))
         degree = np.asarray(neighbours.sum(1)).ravel()
-        self._held = _attachment(mesh, rig, laplacian)
+        creases = find_creases(rig)
+        self._bones = Bones(
+            points, self.body.weights, bind_world, rig, creases, laplacian, step=_STEP, rounds=_ROUNDS
+        )
+        self._bone = _BONE * self._bones.share if bones else np.zeros(len(points))
+        self._skinned = _attachment(mesh, rig, laplacian)
+        self._held = self._skinned + self._bone
         matrix = scipy.sparse.diags_array(degree + self._held) - neighbours
         self._factor = splu(matrix.tocsc())
         self._adjacency, self._degree = neighbours, degree
-        creases = find_creases(rig)
         falloff = geodesic_falloff(mesh, creases, reach=_REACH)
         self.sections = Sections(points, mesh.triangles, falloff, np.array(creases.joints), bind_world)
+        nearest = np.asarray(falloff.tocsc().max(0).todense()).ravel()
+        flesh = (1 - self._bones.share) ** 2 / (_SPREAD + nearest) if bones else np.ones(len(points))
+        self._flesh = flesh[:, None]
         self._response = self._volume_response(points)
         weights = self.body.weights
-        self.key = content_key(_VERSION, points, weights.data, weights.indices, weights.indptr, edges)
+        self.key = content_key(_VERSION + bones, points, weights.data, weights.indices, weights.indptr, edges)
 
     def __call__(self, relative: Tensor) -> Tensor:
         """Posed vertices (B, v, 3) [m], Hips where they are in the bind pose.
@@ -97,25 +116,30 @@ class ElasticSurface:
     @torch.no_grad()
     def _solve(self, relative: Tensor) -> Tensor:
         transforms = self.body.transforms(relative)
-        load = self._elastic_load(self._frames(transforms).numpy(), self.body.skin(transforms).numpy())
+        load = self._elastic_load(self._frames(transforms).numpy())
+        load += self._skinned[:, None] * self.body.skin(transforms).numpy()
+        if self._bone.any():
+            ids = self._bones.ids
+            load[:, ids] += self._bone[ids, None] * self._bones(transforms)
         centres = self.sections.posed_centres(transforms)
         found = self._equilibrium(load)
         pressure = np.zeros((len(relative), self.sections.count))
         for _ in range(_VOLUME_STEPS):
             missing = self.sections.rest_volumes - self.sections.volumes(found, centres)
             pressure += missing @ self._response
-            found = self._equilibrium(load + self.sections.push(found, centres, pressure))
+            found = self._equilibrium(load + self._flesh * self.sections.push(found, centres, pressure))
         return torch.as_tensor(found)
 
-    def _elastic_load(self, frames: np.ndarray, skinned: np.ndarray) -> np.ndarray:
-        """Right-hand side (B, v, 3) of the equilibrium without pressure."""
+    def _elastic_load(self, frames: np.ndarray) -> np.ndarray:
+        """Right-hand side (B, v, 3) of the equilibrium of the edges alone."""
         rest = self.body.identity.rest[0].numpy()
         turned = (frames @ rest[:, :, None])[..., 0]
         # half of sum_j (R_i + R_j)(u_i - u_j), as sums over neighbours
         around = self._neighbours(frames.reshape(*frames.shape[:2], 9)).reshape(frames.shape)
         own = self._degree[:, None] * rest - self._adjacency @ rest
         bent = (frames @ own[:, :, None])[..., 0] + (around @ rest[:, :, None])[..., 0]
-        return 0.5 * (bent - self._neighbours(turned)) + self._held[:, None] * skinned
+        load: np.ndarray = 0.5 * (bent - self._neighbours(turned))
+        return load
 
     def _neighbours(self, values: np.ndarray) -> np.ndarray:
         """Sum (B, v, n) over the neighbours of each vertex."""
@@ -130,8 +154,9 @@ class ElasticSurface:
 
     def _volume_response(self, points: np.ndarray) -> np.ndarray:
         """Pressures (n, n) that give back missing volumes, by the response of the bind pose."""
-        gained = sum(push.T @ self._factor.solve(push) for push in self.sections.rest_gradients(points))
-        return np.linalg.inv(gained + _COMPLIANCE * np.diag(gained.diagonal()))
+        slopes = self.sections.rest_gradients(points)
+        gained = sum(slope.T @ self._factor.solve(self._flesh * slope) for slope in slopes)
+        return np.linalg.inv(gained + _COMPLIANCE * np.diag(gained.diagonal())).T
 
 
 _COMPLIANCE = 0.05

@@ -72,12 +72,14 @@ class ElasticTeacher:
     Args:
         mesh, rig: the canonical body at the mid LOD.
         surface: default: one of this mesh and rig.
+        bones: the default surface has bone under the skin of knees and elbows.
     """
 
-    name = "elastic"
-
-    def __init__(self, mesh: CanonicalMesh, rig: Rig, surface: ElasticSurface | None = None) -> None:
-        self._surface = surface or ElasticSurface(mesh, rig)
+    def __init__(
+        self, mesh: CanonicalMesh, rig: Rig, surface: ElasticSurface | None = None, *, bones: bool = False
+    ) -> None:
+        self.name = "bone" if bones else "elastic"
+        self._surface = surface or ElasticSurface(mesh, rig, bones=bones)
         self.key = self._surface.key
         self.provenance: Mapping[str, Any] = {
             "teacher": self.name,

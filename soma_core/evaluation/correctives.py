@@ -5,12 +5,15 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import partial
+from typing import Any
 
 import numpy as np
 import torch
 from omegaconf import DictConfig
 from torch import Tensor
 
+from soma_core.correctives.bones import bony_share
 from soma_core.correctives.elastic import ElasticSurface
 from soma_core.correctives.masks import find_creases, vertex_mask
 from soma_core.correctives.model import Correctives, find_correctives
@@ -18,6 +21,8 @@ from soma_core.correctives.poses import random_rotations
 from soma_core.correctives.weights import CorrectiveWeights, read_weights
 from soma_core.errors import AssetError
 from soma_core.evaluation.report import Figure, Report, ShownBody, Table
+from soma_core.geometry.laplacian import random_walk
+from soma_core.geometry.mesh import vertex_normals
 from soma_core.geometry.rotations import axis_angle_to_matrix
 from soma_core.io import read_motion
 from soma_core.layer import SomaLayer
@@ -27,6 +32,7 @@ from soma_core.rig.mesh import CanonicalMesh
 from soma_core.rig.skeleton import Rig
 from soma_core.skeleton.identity import Identity
 from soma_core.topology.lod_transfer import offset_rows
+from soma_core.view.joint_picture import draw_joints
 
 __all__ = ["run"]
 
@@ -40,6 +46,19 @@ _BENDS = (
     ("knee", "LeftShin", (1.0, 0.0, 0.0)),
 )
 _BEND_DEG = 120.0
+
+_SHOWN = (
+    *_BENDS,
+    ("hip", "LeftLeg", (-1.0, 0.0, 0.0)),
+    ("shoulder", "LeftArm", (0.0, 0.0, 1.0)),
+)
+_SHOWN_DEG = {"knee": (30, 60, 90, 120, 150), "elbow": (30, 60, 90, 120, 150), "hip": (30, 60, 90, 120)}
+_RAISED_DEG = (30, 60, 90)
+_HELD_TO = 120
+"""Angles beyond are shown, and not held to a bound: the poses that were taught end at 145 degrees."""
+
+_FARTHER, _BULGE, _RING = 0.0, 5.0, 20.0
+_OVER_BONE = 0.5
 
 _BODIES: tuple[tuple[str, str, Mapping[str, float]], ...] = (
     ("soma", "native space, mean", {}),
@@ -98,9 +117,7 @@ def _section_figures(subject: _Subject) -> list[Figure]:
     rig, sections = subject.rig, subject.surface.sections
     figures = []
     for label, joint, axis in _BENDS:
-        relative = subject.surface.body.bind_pose.clone()
-        turn = np.radians(_BEND_DEG) * torch.tensor(axis, dtype=torch.float64)
-        relative[0, rig.user_joint_names.index(joint)] = axis_angle_to_matrix(turn)
+        relative = _bent(subject, joint, axis, _BEND_DEG)
         centres = sections.posed_centres(subject.surface.body.transforms(relative))
         row = int(np.flatnonzero(sections.joints == rig.joint_names.index(joint))[0])
         volumes = [sections.volumes(v.numpy(), centres)[0, row] for v in subject.compare(relative)]
@@ -115,6 +132,74 @@ def _section_figures(subject: _Subject) -> list[Figure]:
             ),
         ]  # fmt: skip
     return figures
+
+
+def _bent(subject: _Subject, joint: str, axis: tuple[float, float, float], degrees: float) -> Tensor:
+    """The bind pose with one joint turned from the T-pose, (1, J - 1, 3, 3)."""
+    relative = subject.surface.body.bind_pose.clone()
+    turn = np.radians(degrees) * torch.tensor(axis, dtype=torch.float64)
+    relative[0, subject.rig.user_joint_names.index(joint)] = axis_angle_to_matrix(turn)
+    return relative
+
+
+def _shape_rows(subject: _Subject) -> list[list[Any]]:
+    """How joints look when they bend: normals, and the skin over the bone of knees and elbows.
+
+    A row holds the joint, the angle, the farthest that a normal turns against the bone above [degrees] by
+    twist skinning and with correctives, how much farther than at rest skin over bone is from the joint [mm],
+    and the largest Laplacian of that distance [1/m]: a ring around the kneecap has a large one.
+    """
+    rig, mesh, body = subject.rig, subject.mesh, subject.surface.body
+    rest, triangles, edges = rig.bind_shape, mesh.triangles, mesh.edges()
+    creases = find_creases(rig)
+    bones, ridge = bony_share(rig, creases), random_walk(edges, len(rest))
+    squared = ((rest[edges[:, 0]] - rest[edges[:, 1]]) ** 2).sum(1)
+    ends = edges.T.ravel()
+    spacing = np.bincount(ends, np.tile(squared, 2)) / np.bincount(ends)  # mean squared edge of a vertex
+    normals = vertex_normals(rest, triangles)
+    rows = []
+    for label, name, axis in _SHOWN:
+        joint = rig.joint_names.index(name)
+        near = np.linalg.norm(rest - rig.bind_world[joint, :3, 3], axis=1) < 2 * creases.radius[joint]
+        for degrees in _SHOWN_DEG.get(label, _RAISED_DEG):
+            relative = _bent(subject, name, axis, degrees)
+            transforms = body.transforms(relative)
+            plain, corrected, _ = (found[0].numpy() for found in subject.compare(relative))
+            above = transforms[0, rig.parents[joint], :, :3].numpy()
+            row: list[Any] = [label, degrees]
+            for vertices in (plain, corrected):
+                cosine = ((vertex_normals(vertices, triangles) @ above) * normals)[near].sum(1)
+                row.append(float(np.degrees(np.arccos(cosine.clip(-1, 1))).max()))
+            if joint in bones:
+                place = rig.bind_world[joint, :3, 3]
+                moved = transforms[0, joint, :, :3].numpy() @ place + transforms[0, joint, :, 3].numpy()
+                farther = np.linalg.norm(corrected - moved, axis=1) - np.linalg.norm(rest - place, axis=1)
+                over = bones[joint] > _OVER_BONE
+                curved = 4 * np.abs(ridge @ farther) / spacing
+                row += [1e3 * float(farther[over].max()), float(curved[over].max())]
+            rows.append([*row, *[None] * (6 - len(row))])
+    return rows
+
+
+def _shape_figures(rows: list[list[Any]], *, bones: bool) -> list[Figure]:
+    """What the rows of :func:`_shape_rows` come to; skin over bone is bound where a teacher has bones."""
+    held = [row for row in rows if row[1] <= _HELD_TO]
+    bony = [row for row in rows if row[4] is not None]
+    ring = max(row[5] for row in bony if row in held)
+    return [
+        Figure(
+            name="normals turn farther than by twist skinning", value=max(row[3] - row[2] for row in held),
+            unit="degrees", bound=_FARTHER,
+        ),
+        Figure(
+            name="skin over bone, farther from the joint than at rest", value=max(row[4] for row in bony),
+            unit="mm", bound=_BULGE if bones else None,
+        ),
+        Figure(
+            name="skin over bone, Laplacian of that distance", value=ring, unit="1/m",
+            bound=_RING if bones else None,
+        ),
+    ]  # fmt: skip
 
 
 def _exact_figures(subject: _Subject, weights: CorrectiveWeights) -> list[Figure]:
@@ -173,7 +258,9 @@ def _seconds(call: Callable[[], Tensor], repeats: int = 5) -> float:
     return min(taken)
 
 
-def _bodies(subject: _Subject, motion: np.ndarray) -> tuple[list[list[str | float | None]], list[ShownBody]]:
+def _bodies(
+    subject: _Subject, motion: np.ndarray, *, bones: bool
+) -> tuple[list[list[str | float | None]], list[ShownBody]]:
     """The same correctives on other bodies: error to a teacher of their own, and pictures of one pose."""
     rows: list[list[str | float | None]] = []
     shown = []
@@ -182,7 +269,7 @@ def _bodies(subject: _Subject, motion: np.ndarray) -> tuple[list[list[str | floa
     for backend, label, params in _BODIES:
         layer = SomaLayer(backend, dtype=torch.float64, correctives=None)
         identity = layer.identity(params)
-        surface = ElasticSurface(subject.mesh, subject.rig, identity=identity)
+        surface = ElasticSurface(subject.mesh, subject.rig, identity=identity, bones=bones)
         own = _Subject(mesh=subject.mesh, rig=subject.rig, surface=surface, model=subject.model)
         before, after, _ = _errors(own, motion)
         height = float(np.ptp(identity.rest[0, :, 1].numpy()))
@@ -220,7 +307,8 @@ def run(config: DictConfig) -> Report:
     weights = read_weights(path)
     mesh, rig = load_canonical("mid")
     model = Correctives(weights, rig, offset_rows(mesh), dtype=torch.float64, device="cpu")
-    subject = _Subject(mesh=mesh, rig=rig, surface=ElasticSurface(mesh, rig), model=model)
+    bones = weights.meta.get("teacher") == "bone"
+    subject = _Subject(mesh=mesh, rig=rig, surface=ElasticSurface(mesh, rig, bones=bones), model=model)
     motions = _unseen(rig, config.experiment.count, list(config.experiment.motions))
     rows: list[list[str | float | None]] = []
     figures = []
@@ -230,7 +318,8 @@ def run(config: DictConfig) -> Report:
         left = 100 * after / before
         figures.append(Figure(name=f"error to the teacher left, {name}", value=left, unit="%", bound=_LEFT))
     clip = motions["range_of_motion"]
-    body_rows, shown = _bodies(subject, clip[:: max(1, len(clip) // 16)])
+    bent = _shape_rows(subject)
+    body_rows, shown = _bodies(subject, clip[:: max(1, len(clip) // 16)], bones=bones)
     return Report(
         title="Pose correctives against their teacher, on motions held out from training",
         tables=[
@@ -240,18 +329,27 @@ def run(config: DictConfig) -> Report:
                 rows=rows,
             ),
             Table(
+                title="One joint bent: the farthest turn of a normal, and skin over bone",
+                columns=(
+                    "joint", "degrees", "twist skinning, degrees", "with correctives, degrees",
+                    "farther than at rest, mm", "Laplacian of that, 1/m",
+                ),
+                rows=bent,
+            ),
+            Table(
                 title="Other bodies, each against a teacher of its own (range of motion)",
                 columns=("body", "height, m", "twist skinning, mm", "with correctives, mm", "error gone, %"),
                 rows=body_rows,
             ),
         ],
         figures=[
-            *figures, *_section_figures(subject), *_exact_figures(subject, weights),
-            *_cost_figures(weights, subject),
+            *figures, *_section_figures(subject), *_shape_figures(bent, bones=bones),
+            *_exact_figures(subject, weights), *_cost_figures(weights, subject),
         ],
         notes=(
             f"Teacher: {weights.meta.get('teacher')}; made by commit {str(weights.meta.get('commit'))[:12]}. "
             "Times are those of this run, in passing.",
         ),
         bodies=shown,
+        pictures={"joints.png": partial(draw_joints, checkpoint=config.experiment.checkpoint)},
     )  # fmt: skip

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -90,6 +91,7 @@ class Report:
         notes: sentences that explain the figures.
         tables: what is compared but not held to a bound; shown before the figures.
         bodies: what is worth looking at; drawn as ``errors.png``.
+        pictures: further ones: name of the PNG, and what draws it at a path.
     """
 
     title: str
@@ -97,6 +99,7 @@ class Report:
     notes: Sequence[str] = field(default_factory=tuple)
     tables: Sequence[Table] = field(default_factory=tuple)
     bodies: Sequence[ShownBody] = field(default_factory=tuple)
+    pictures: Mapping[str, Callable[[Path], None]] = field(default_factory=dict)
 
     @property
     def failed(self) -> list[Figure]:

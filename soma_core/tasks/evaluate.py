@@ -47,15 +47,15 @@ def run(config: DictConfig, output: Path) -> None:
     document = json.dumps(report.as_json(), indent=2) + "\n"
     atomic_write(output / "report.json", lambda path: path.write_text(document, encoding="utf-8") and None)
     atomic_write(output / "report.md", lambda path: path.write_text(text, encoding="utf-8") and None)
-    _draw(output / "errors.png", report)
+    _draw(output, report)
     if report.failed:
         worst = "; ".join(f"{f.name} is {f.value:.4g} {f.unit}, bound {f.bound:g}" for f in report.failed)
         raise SomaError(f"{name}: {worst}. See {output / 'report.md'}")
 
 
-def _draw(path: Path, report: Report) -> None:
-    """Draw the bodies of a report, if it has any; without pyvista there is no picture, and that is said."""
-    if not report.bodies:
+def _draw(folder: Path, report: Report) -> None:
+    """Draw what a report shows, if anything; without pyvista there is no picture, and that is said."""
+    if not report.bodies and not report.pictures:
         return
     from soma_core.view.error_picture import error_sheet
     from soma_core.view.stage import Body
@@ -65,6 +65,9 @@ def _draw(path: Path, report: Report) -> None:
         for body in report.bodies
     ]
     try:
-        error_sheet(path, bodies, [body.errors_mm for body in report.bodies])
+        if bodies:
+            error_sheet(folder / "errors.png", bodies, [body.errors_mm for body in report.bodies])
+        for name, draw in report.pictures.items():
+            draw(folder / name)
     except SomaError as error:
         _log.warning("no picture: %s", error)

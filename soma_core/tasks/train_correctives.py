@@ -94,14 +94,14 @@ def run(config: DictConfig, output: Path) -> None:
 
 
 def make_teacher(name: str, mesh: CanonicalMesh, rig: Rig) -> Teacher:
-    """The elastic surface, or the backend `name` and its own posed meshes.
+    """The elastic surface, with bone or without, or the backend `name` and its own posed meshes.
 
     Raises:
         InputError: a backend that cannot show posed meshes.
         BackendError: no such backend, or not usable.
     """
-    if name == "elastic":
-        return ElasticTeacher(mesh, rig)
+    if name in ("elastic", "bone"):
+        return ElasticTeacher(mesh, rig, bones=name == "bone")
     from soma_core.tasks.posed_teacher import PosedTeacher
 
     return PosedTeacher(name)

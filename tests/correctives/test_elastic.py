@@ -5,6 +5,7 @@ import pytest
 import torch
 
 from soma_core.correctives.bind_body import BindBody, pulled_back
+from soma_core.correctives.bones import bony_share
 from soma_core.correctives.elastic import ElasticSurface
 from soma_core.correctives.frames import SurfaceFrames, diffused, surface_frames_reference
 from soma_core.correctives.masks import geodesic_falloff
@@ -56,6 +57,26 @@ def test_bent_limbs_keep_their_volume(surface, body, bind_pose, joint, axis):
     )
     assert skinned < 0.97  # there is something to correct
     assert abs(kept - 1) < LOST
+
+
+def test_skin_over_bone_keeps_its_distance_from_the_joint_and_feels_no_pressure(body, bind_pose):
+    surface = ElasticSurface(body.mesh, body.rig, bones=True)
+    bones, rest, names = surface._bones, body.rig.bind_shape, body.rig.joint_names
+    pose = _bent(body, bind_pose, "LeftShin", [np.radians(100), 0, 0])
+    transforms = surface.body.transforms(pose)
+    share = bony_share(body.rig, body.creases)[names.index("LeftShin")]
+    ids = np.flatnonzero(share > 0.9)
+    front = rest[ids, 2] - body.rig.bind_world[names.index("LeftShin"), 2, 3]
+    assert front.max() > 0.01  # a kneecap
+    assert front.min() > -0.9 * np.abs(rest[share > 0, 2]).max()  # and no hollow of the knee
+    place = body.rig.bind_world[names.index("LeftShin"), :3, 3]
+    moved = transforms[0, names.index("LeftShin")].numpy() @ np.append(place, 1)
+    arc = bones(transforms)[0, np.searchsorted(bones.ids, ids)]
+    away = np.linalg.norm(rest[ids] - place, axis=1)
+    np.testing.assert_allclose(np.linalg.norm(arc - moved, axis=1), away, atol=ROUNDING)
+    skinned = surface.body.skin(transforms)[0, ids].numpy()
+    assert (np.linalg.norm(skinned - moved, axis=1) < away - 0.001).any()  # which skinning pulls in
+    assert surface._flesh[ids].max() < 0.1 * surface._flesh.max()
 
 
 def test_lessons_turn_skinning_into_the_surface(surface, body):

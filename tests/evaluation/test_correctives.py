@@ -57,6 +57,20 @@ def test_sections_are_those_of_bent_joints(subject):
     np.testing.assert_allclose(taught, 100, atol=6)  # a bend of 120 degrees of a coarse tube
 
 
+def test_joints_that_skinning_alone_bends_turn_no_farther_and_have_no_balloons(subject, weights):
+    none = dataclasses.replace(weights, second=0 * weights.second)
+    model = Correctives(none, subject.rig, offset_rows(subject.mesh), dtype=torch.float64, device="cpu")
+    rows = correctives._shape_rows(dataclasses.replace(subject, model=model))
+    assert {row[0] for row in rows} == {"elbow", "knee", "hip", "shoulder"}
+    assert all(row[2] == row[3] for row in rows)
+    assert all((row[4] is None) == (row[0] in ("hip", "shoulder")) for row in rows)
+    turned, farther, ring = correctives._shape_figures(rows, bones=True)
+    assert turned.passed
+    assert farther.value < 0.5  # millimetres; skinning pulls skin towards the joint
+    rows[0][3], rows[0][4], rows[1][5] = rows[0][2] + 1, 13.7, 2 * ring.bound
+    assert not any(figure.passed for figure in correctives._shape_figures(rows, bones=True))
+
+
 def test_pictures_show_the_offsets(subject):
     pose = torch.as_tensor(correctives._unseen(subject.rig, 1, [])["random poses"])
     rest, posed = correctives._pictured(subject, subject.surface.body.identity, "body", pose)
