@@ -173,7 +173,9 @@ def test_shards_are_trained_on(config, shards, tmp_path):
 
 def test_the_teacher_is_chosen_by_one_word():
     mesh, rig = tiny_canonical()
-    assert train_correctives.make_teacher("elastic", mesh, rig).name == "elastic"
+    elastic, bone = (train_correctives.make_teacher(name, mesh, rig) for name in ("elastic", "bone"))
+    assert (elastic.name, bone.name) == ("elastic", "bone")
+    assert elastic.key != bone.key  # nor are their lessons
     with pytest.raises(InputError, match="teacher: got soma, whose generator offers no posed meshes"):
         train_correctives.make_teacher("soma", mesh, rig)
 

@@ -8,6 +8,7 @@ import pytest
 
 from soma_core.errors import SomaError
 from soma_core.view import picture
+from soma_core.view.joint_picture import draw_joints
 from soma_core.view.picture import backend_colour, contact_sheet, gallery
 from soma_core.view.stage import Body
 
@@ -135,3 +136,12 @@ def test_a_single_frame_is_a_third_as_wide(pyvista, tmp_path):
     contact_sheet(tmp_path / "sheet.png", [box(0.5, 1.5, (0.2, 0.8, 0.2))], width=600)
     with PIL.open(tmp_path / "sheet.png") as picture:
         assert picture.width == 200
+
+
+@pytest.mark.slow  # 20 s: seventy-two cells
+def test_bent_joints_are_drawn_from_near(pyvista, tmp_path):
+    draw_joints(tmp_path / "joints.png")
+    drawn = np.asarray(PIL.open(tmp_path / "joints.png").convert("RGB"), int)
+    cells = [np.array_split(row, 9, axis=1) for row in np.array_split(drawn, 8)]
+    assert all((np.abs(cell - drawn[0, 0]).sum(-1) > 60).mean() > 0.05 for row in cells for cell in row)
+    assert all(not np.array_equal(row[6], row[8]) for row in cells)  # plain skinning and correctives
