@@ -7,11 +7,13 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
 import torch
 
+from soma_core.animation.posed import Posed
 from soma_core.geometry.rotations import axis_angle_to_matrix
 from soma_core.layer import SomaLayer
-from soma_core.view.stage import PAPER, Body, open_stage
+from soma_core.view.stage import PAPER, Body, Stage, open_stage
 
 if TYPE_CHECKING:
     from PIL.Image import Image
@@ -57,16 +59,22 @@ def draw_joints(path: Path, checkpoint: str | None = None) -> None:
             turns[:, number] = axis_angle_to_matrix(radians[:, None] * torch.tensor(axis).float())
             with torch.no_grad():
                 posed = [pose(identity, turns, torch.zeros(len(angles), 3)) for pose in layers]
-            for side in sides:
-                view = axis_angle_to_matrix(torch.deg2rad(torch.tensor(side))).numpy()
-                cells = []
-                for frame, one in itertools.product(range(len(angles)), posed):
-                    skin = one.vertices[frame].numpy() @ view.T
-                    body = Body(vertices=skin, triangles=layer.mesh.triangles, colour=_COLOUR)
-                    focus = view @ one.joints[frame, number].numpy()
-                    cells.append(stage.shot([body], focus=focus, height=_TALL, flat=True, floor=_FAR_BELOW))
-                rows.append((name, angles, cells))
+            rows += [(name, angles, _row(stage, posed, layer.mesh.triangles, number, side)) for side in sides]
     _sheet(rows).save(path)
+
+
+def _row(
+    stage: Stage, posed: Sequence[Posed], triangles: np.ndarray, joint: int, side: Sequence[float]
+) -> list[Image]:
+    """Cells of one side, frame by frame, about a user joint."""
+    view = axis_angle_to_matrix(torch.deg2rad(torch.tensor(side))).numpy()
+    cells = []
+    for frame, one in itertools.product(range(len(posed[0].vertices)), posed):
+        skin = one.vertices[frame].numpy() @ view.T
+        body = Body(vertices=skin, triangles=triangles, colour=_COLOUR)
+        focus = view @ one.joints[frame, joint].numpy()
+        cells.append(stage.shot([body], focus=focus, height=_TALL, flat=True, floor=_FAR_BELOW))
+    return cells
 
 
 def _sheet(rows: Sequence[tuple[str, Sequence[int], Sequence[Image]]]) -> Image:
