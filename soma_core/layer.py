@@ -145,6 +145,8 @@ class SomaLayer(PartialBodies):
             self.posing, self.correctives, dtype=self.dtype, device=self.device, by_patches=by_patches
         )
         self.animation.fuse(by_patches=by_patches)
+        self.animation.skinning.blend = self.animation.blend
+        self.posing.posed_skinning.blend = fused.skin
         fits = fused.fits and (self.animation.patches is not None or not by_patches)
         self.fused = fused if fits else None
         self.rest_shape.fit.rotations.fused = True

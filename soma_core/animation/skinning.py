@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Iterator, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import scipy.sparse
@@ -14,6 +14,9 @@ from torch import Tensor
 from soma_core.geometry.constants import constant
 from soma_core.geometry.sparse import Csr, SparseRows, gather_rows, sparse_product
 from soma_core.geometry.torch_func import transformed
+
+if TYPE_CHECKING:
+    from soma_core.kernels.body_skin_wp import Blend
 
 __all__ = ["Skinning", "skinning_transforms"]
 
@@ -125,6 +128,9 @@ class Skinning(torch.nn.Module):
 
     Vertices travel as planes (3, v, B), batch innermost, so that one sparse row touches many poses at once
     and every elementwise step runs over contiguous memory.
+
+    Attributes:
+        blend: the weights for a kernel that does the same with bodies in SIMD lanes, where there is one.
     """
 
     def __init__(
@@ -132,6 +138,7 @@ class Skinning(torch.nn.Module):
     ) -> None:
         super().__init__()
         self.weights = SparseRows(weights, dtype=dtype, device=device)
+        self.blend: Blend | None = None
         weights = weights.sorted_indices()
         vertices, joints = weights.shape
         columns = (4 * weights.indices.astype(np.int64)[:, None] + np.arange(4)).ravel()
@@ -156,12 +163,21 @@ class Skinning(torch.nn.Module):
             points: (3, v, B) or (3, v, 1) [m].
             transforms: (B, J, 3, 4) from :func:`skinning_transforms`.
         """
+        if self.blend is not None and not transformed():
+            skinned = self._in_lanes(points.permute(2, 1, 0), transforms)
+            return skinned if rows else skinned.permute(2, 1, 0)
         planes = transforms.permute(2, 3, 1, 0)
         if transformed():
             blended = self.weights(planes.permute(2, 0, 1, 3).flatten(1)).unflatten(1, planes[:, :, 0].shape)
             skinned = (blended[:, :, :3] * points.transpose(0, 1)[:, None]).sum(2) + blended[:, :, 3]
             return skinned.permute(2, 0, 1).contiguous() if rows else skinned.transpose(0, 1)
         return _blend(points, planes, rows, [*self.weights.csr, *self.weights.transpose])
+
+    def _in_lanes(self, points: Tensor, transforms: Tensor) -> Tensor:
+        from soma_core.kernels.body_skin_back_wp import skin
+
+        assert self.blend is not None
+        return skin(points, transforms, self.blend)
 
     def into(self, out: Tensor, points: Tensor, transforms: Tensor) -> None:
         """Write skinned vertices into `out`, contiguous (B, v, 3); no derivative."""
@@ -173,6 +189,8 @@ class Skinning(torch.nn.Module):
         Weights and points fold into one sparse matrix (v, 4 J), so a pose costs one sparse product.
         Gradients reach the transforms only.
         """
+        if self.blend is not None:
+            return self._in_lanes(vertices[None], transforms)
         point = torch.cat((vertices, torch.ones_like(vertices[:, :1])), 1)
         values = (self.weights.val[:, None] * point[self.influence_vertex]).ravel()
         pattern = (self.point_crow, self.point_col, values)

@@ -15,7 +15,7 @@ import warp as wp
 
 from soma_core.kernels._lanes import ABREAST
 
-__all__ = ["native", "transposing"]
+__all__ = ["HALVES", "native", "transposing"]
 
 _BYTES = 64
 """A square of vectors of this size is transposed in registers."""
@@ -41,6 +41,21 @@ def native(body: str, scalar: str, lanes: int, stub: Callable) -> wp.Function:
     stub.__name__ = f"{stub.__name__}_{scalar}_{lanes}"
     stub.__qualname__ = stub.__name__
     return wp.func_native(text)(stub)
+
+
+HALVES = """
+#if defined(__CUDA_ARCH__) || !defined(__clang__)
+    typedef V H; typedef M HM;
+#elif defined(__AVX512F__)
+    typedef V H; typedef H* HM;
+#else
+    typedef R H __attribute__((vector_size(sizeof(V) > 32 ? 32 : sizeof(V)), aligned(sizeof(R))));
+    typedef H* HM;
+#endif
+    constexpr int P = sizeof(V) / sizeof(H);
+"""
+"""What a register holds: ``P`` parts ``H`` of a vector, one behind the other, at ``HM``. A dozen sums of
+whole vectors do not fit into the registers of a processor without AVX-512."""
 
 
 _ABREAST = f"""

@@ -13,12 +13,12 @@ import warp as wp
 from torch import Tensor
 
 from soma_core.kernels._lanes import as_rows, in_threads, launch, row_of, worker_count, working_rows
-from soma_core.kernels._native import native, transposing
-from soma_core.kernels._residual_phases import BLEND, OFFSET, TILE
+from soma_core.kernels._native import HALVES, native, transposing
+from soma_core.kernels._residual_phases import OFFSET, TILE
 from soma_core.kernels._runtime import as_warp, scalar_name
 from soma_core.kernels._view_text import TANH
 
-__all__ = ["Added", "Blend", "blend_of", "skin_bodies"]
+__all__ = ["Added", "Blend", "Strides", "blend_of", "drawing", "lanes_of", "skin_bodies", "strides_of"]
 
 _WIDTHS = {torch.float32: (4, 8, 16), torch.float64: (4, 8)}
 """Bodies a thread may treat at once: SIMD registers of current CPUs, wide ones split where there are none."""
@@ -85,7 +85,7 @@ class _Task:
 
 
 @wp.struct
-class _Strides:
+class Strides:
     """Numbers from one body, one vertex, one axis of the points to the next."""
 
     body: wp.int64
@@ -98,12 +98,12 @@ def _kernel(scalar: str, lanes: int):
     width, size = lanes, TILE
     real, rows = wp.array(dtype=getattr(wp, scalar)), wp.array3d(dtype=getattr(wp, scalar))
     (load, store), row = transposing(scalar, lanes), row_of(scalar)
-    draw, activate, move, skin = _steps(real, scalar, lanes)
+    draw, (activate, move, skin) = drawing(scalar, lanes), _steps(real, scalar, lanes)
     module = wp.get_module(f"soma_body_skin_{scalar}_{lanes}")
 
     @wp.kernel(module=module, enable_backward=False)
     def run(
-        task: _Task, by: _Strides,
+        task: _Task, by: Strides,
         skin_start: _ids, skin_joint: _short, skin_value: real,
         first_start: _ids, first_joint: _short, first_value: real,
         active_start: _ids, active_id: _short, active_value: real,
@@ -141,13 +141,21 @@ def _kernel(scalar: str, lanes: int):
     return run
 
 
-def _steps(real, scalar: str, lanes: int):
-    def draw(
+@functools.cache
+def drawing(scalar: str, lanes: int) -> wp.Function:
+    """Function that brings vertices begin .. stop of bodies, however they lie, into a tile."""
+    real = wp.array(dtype=getattr(wp, scalar))
+
+    def draw_bodies(
         source: real, body: wp.int64, vertex: wp.int64, axis: wp.int64, first: int, last: int,
         begin: int, stop: int, tile: real,
     ):  # fmt: skip
         ...
 
+    return native(_DRAW, scalar, lanes, draw_bodies)
+
+
+def _steps(real, scalar: str, lanes: int):
     def activate(
         start: _ids, column: _short, value: real, squashed: int, features: int, count: int, given: real,
         active: real,
@@ -162,7 +170,7 @@ def _steps(real, scalar: str, lanes: int):
         start: _ids, joint: _short, value: real, transforms: real, first: int, stop: int, tile: real
     ): ...
 
-    bodies = {draw: _DRAW, activate: _ACTIVATE, move: _MOVE, skin: _SKIN}
+    bodies = {activate: _ACTIVATE, move: _MOVE, skin: _SKIN}
     for stub in bodies:
         stub.__name__ += "_bodies"
     return tuple(native(body, scalar, lanes, stub) for stub, body in bodies.items())
@@ -212,15 +220,22 @@ _MOVE = (
 )
 
 _SKIN = (
-    """
-    M transform = (M)transforms.data, x = (M)tile.data;
-    for (int v = first; v < stop; v++, x += 3) {
-"""
-    + BLEND
+    HALVES
     + """
-        const V p = x[0], q = x[1], r = x[2];
-        for (int i = 0; i < 3; i++) x[i] = m[4 * i] * p + m[4 * i + 1] * q + m[4 * i + 2] * r + m[4 * i + 3];
-    }
+    HM transform = (HM)transforms.data, x = (HM)tile.data;
+    for (int v = first; v < stop; v++, x += 3 * P)
+        for (int h = 0; h < P; h++) {
+            H m[12];
+            for (int k = 0; k < 12; k++) m[k] = H{};
+            for (int e = start.data[v]; e < start.data[v + 1]; e++) {
+                HM t = transform + (12 * P * joint.data[e] + h);
+                const R w = value.data[e];
+                for (int k = 0; k < 12; k++) m[k] += w * t[k * P];
+            }
+            const H p = x[h], q = x[P + h], r = x[2 * P + h];
+            for (int i = 0; i < 3; i++)
+                x[i * P + h] = m[4 * i] * p + m[4 * i + 1] * q + m[4 * i + 2] * r + m[4 * i + 3];
+        }
 """
 )
 
@@ -247,16 +262,13 @@ def skin_bodies(
         out = points.new_empty(count, vertices, 3)
     if not out.numel():
         return out
-    lanes, tiles = _lanes(count, points), -(-vertices // TILE)
+    lanes, tiles = lanes_of(count, points), -(-vertices // TILE)
     groups, threads = -(-count // lanes), torch.get_num_threads()
     shares = max(1, min(threads // groups, tiles))  # of the tiles, where there are more threads than groups
     kernel, none = _kernel(scalar_name(points.dtype), lanes), points.new_zeros(1)
     blends = skin, first or skin, *((skin, skin) if added is None else added[:2])
     frames = [none if one is None else one.contiguous() for one in (transforms, before, features)]
-    strides = _Strides()
-    strides.body, strides.vertex, strides.axis = points.stride()
-    if len(points) == 1:
-        strides.body = 0
+    strides = strides_of(points)
     joints, reposed = transforms.shape[1], 0 if before is None else before.shape[1]
     seen, moving = (0, 0) if added is None or features is None else (features.shape[1], _rows(added.first))
     sizes = 12 * joints, 12 * reposed, seen, moving, 3 * TILE
@@ -286,7 +298,16 @@ def _rows(blend: Blend) -> int:
     return len(blend.start) - 1
 
 
-def _lanes(count: int, like: Tensor) -> int:
+def strides_of(points: Tensor) -> Strides:
+    """Of points (B or 1, v, 3); one body serves all."""
+    strides = Strides()
+    strides.body, strides.vertex, strides.axis = points.stride()
+    if len(points) == 1:
+        strides.body = 0
+    return strides
+
+
+def lanes_of(count: int, like: Tensor) -> int:
     """Bodies a thread treats at once: as few as keep every thread busy, as many as a register holds."""
     share = -(-count // torch.get_num_threads())
     widths = _WIDTHS[like.dtype]
