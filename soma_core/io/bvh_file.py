@@ -26,6 +26,9 @@ _MOST_JOINTS = 4096
 _CHUNK = 1 << 18
 """Bytes of text that are taken at once: what is made of them stays in the processor's cache."""
 
+_MOST_HIERARCHY = 1 << 24
+"""Bytes in which MOTION has to follow: 4,096 joints take a tenth of that."""
+
 _ROWS = 128
 _WORD = re.compile(
     rb"(?i:(ROOT|JOINT)[ \t]+([^\r\n{}]+))|(?i:(End)[ \t]*Site[^\r\n{}]*)"
@@ -136,7 +139,8 @@ def _hierarchy(path: Path, text: mmap.mmap) -> tuple[_Tree, int]:
     """
     tree, stack, opened = _Tree(), [-1], 0
     pending: int | None = None  # joint whose brace is awaited; -2 for an End Site
-    for word in _WORD.finditer(text, len(_MARK) if text[: len(_MARK)] == _MARK else 0):
+    begin = len(_MARK) if text[: len(_MARK)] == _MARK else 0
+    for word in _WORD.finditer(text, begin, _MOST_HIERARCHY):
         kind, name, end, entry, numbers, motion, brace, other = word.groups()
         if motion:
             if opened or not tree.names:
@@ -258,12 +262,12 @@ def _numbers(path: Path, text: mmap.mmap, at: int) -> np.ndarray:
 
 
 def _pieces(text: mmap.mmap, at: int) -> Iterator[bytes]:
-    """Pieces that end between two numbers."""
+    """Pieces that end between two numbers, or within a word that is longer than any number."""
     rest = b""
     for start in range(at, len(text), _CHUNK):
         piece = rest + text[start : start + _CHUNK]
         cut = max(piece.rfind(blank) for blank in (b" ", b"\n", b"\t", b"\r"))
-        rest = piece[cut + 1 :] if start + _CHUNK < len(text) else b""
+        rest = piece[cut + 1 :] if cut >= 0 and start + _CHUNK < len(text) else b""
         yield piece[: len(piece) - len(rest)]
 
 

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import csv
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +15,7 @@ from soma_core.errors import InputError
 from soma_core.io.data_files import open_data
 from soma_core.io.humanml3d import joints_of_humanml3d
 from soma_core.io.json_frames import frame_files
+from soma_core.io.text_numbers import table_rows
 from soma_core.json_file import read_json
 
 __all__ = ["PointFrames", "is_one", "read_points"]
@@ -198,16 +199,14 @@ def _no_points(path: Path, shape: object, kind: object, size: int, views: int = 
 
 def _of_table(path: Path, size: int) -> PointFrames:
     """A table with commas, semicolons or tabs: a row a frame, a column for each axis of a point."""
-    with open(path, newline="", encoding="utf-8-sig") as stream:
-        lines = stream.read().splitlines()
-    between = max(",;\t", key=lines[0].count) if lines else ","
-    rows = [row for row in csv.reader(lines, delimiter=between) if any(cell.strip() for cell in row)]
-    if between != ",":  # where a comma may be that of decimals
-        rows = [[cell.replace(",", ".") for cell in row] for row in rows]
-    if not rows:
+    rows = table_rows(path)
+    first = next(rows, [])
+    head = None if _numbers(first) is not None else [cell.strip() for cell in first]
+    if head is None:
+        rows = chain([first] if first else [], rows)
+    values = np.array([_cells(path, number, row, len(first)) for number, row in enumerate(rows)])
+    if not len(values):
         raise InputError(str(path), got="an empty table", expected="a row a frame", fix="Write it again.")
-    head = None if _numbers(rows[0]) is not None else [cell.strip() for cell in rows.pop(0)]
-    values = np.array([_cells(path, number, row, len(rows[0])) for number, row in enumerate(rows)])
     if head is None:
         return _shaped(path, values, None, None, size)
     columns: dict[str, dict[str, int]] = {}
@@ -235,14 +234,14 @@ def _numbers(cells: Sequence[str]) -> list[float] | None:
         return None
 
 
-def _cells(path: Path, number: int, row: Sequence[str], count: int) -> list[float]:
+def _cells(path: Path, number: int, row: Sequence[str], count: int) -> np.ndarray:
     found = [(_numbers([cell]) or [np.nan])[0] for cell in row]
     if len(found) != count:
         raise InputError(
-            f"{path}, row {number}", got=f"{len(found)} cells", expected=f"{count}, as in the first",
+            f"{path}: row {number}", got=f"{len(found)} cells", expected=f"{count}, as in the first",
             fix="Write the table again.",
         )  # fmt: skip
-    return found
+    return np.array(found)
 
 
 def _of_folder(path: Path, person: str | None, size: int) -> PointFrames:

@@ -1,10 +1,20 @@
-"""Numbers of a text by arithmetic on its bytes: four times as fast as parsers that go from word to word."""
+"""Numbers of a text by arithmetic on its bytes, four times as fast as word by word; rows of tables."""
 
 from __future__ import annotations
 
+import csv
+from collections.abc import Iterator
+from pathlib import Path
+
 import numpy as np
 
-__all__ = ["numbers_of_text"]
+from soma_core.errors import AssetError
+from soma_core.files import refuse_unreadable
+
+__all__ = ["numbers_of_text", "table_rows"]
+
+_MOST_BYTES, _LONGEST = 1 << 30, 1 << 20
+"""Bytes of a table, and letters of a line: hours of all joints, and a row of a dense mesh."""
 
 _PAD = 16
 _MOST_DIGITS = 15
@@ -77,3 +87,26 @@ def _digits(words: np.ndarray, count: np.ndarray) -> np.ndarray:
     found = (found * np.uint64(100) + (found >> np.uint64(16))) & np.uint64(0x0000FFFF0000FFFF)
     found = (found * np.uint64(10000) + (found >> np.uint64(32))) & np.uint64(0xFFFFFFFF)
     return found.astype(np.float64)
+
+
+def table_rows(path: Path) -> Iterator[list[str]]:
+    """Cells of each line that has any of a table with commas, semicolons or tabs, as its first line has.
+
+    Raises:
+        AssetError: no file, or one that is no text or has a line without end.
+    """
+    refuse_unreadable(path, most_bytes=_MOST_BYTES)
+    try:
+        with open(path, newline="", encoding="utf-8-sig") as stream:
+            between = ""
+            while line := stream.readline(_LONGEST):
+                if len(line) == _LONGEST:
+                    raise csv.Error(f"a line of {_LONGEST} letters or more")
+                between = between or max(",;\t", key=line.count)
+                row = next(csv.reader([line], delimiter=between), [])
+                if between != ",":  # where a comma may be that of decimals
+                    row = [cell.replace(",", ".") for cell in row]
+                if any(map(str.strip, row)):
+                    yield row
+    except (csv.Error, UnicodeDecodeError) as error:
+        raise AssetError(path, cause=f"not a table of numbers ({error})", fix="Write it again.") from error

@@ -20,6 +20,10 @@ _NEAR = 0.0025
 """Distance between wrap and skin, of the body's diagonal, up to which they lie on each other: 5 mm of 2 m.
 A coarse wrap stands off a round body by up to half an edge."""
 
+_EDGE, _AT_MOST = 0.25, 2.0
+"""Share of the edges at a skin vertex by which it may stand out of the wrap, and how many times the distance
+above that may be: corners of a coarse mesh do, on whose flats a wrap lies."""
+
 COVERED = 0.9
 """Share of a segment that lies on the other surface, either way; nostrils, lips and the skin between fingers
 do not."""
@@ -32,6 +36,10 @@ _MITTEN = 2
 
 _OUTER = 0.3
 """Share of a digit's length from its base that may lie on its neighbour: where fingers begin is not sharp."""
+
+_COARSE, _UNTOLD = 0.25, 0.75
+"""Edges of the skin at a digit, of its length, from which on less of it is asked for, and nothing: where one
+ends is known to an edge, and a toe of three vertices has no shape."""
 
 _FUSED = 0.6
 """Share of a digit's length up to which it may lie where the skin has no digits: those of scans, and of hands
@@ -60,10 +68,12 @@ class Share:
     Attributes:
         wrap: of the wrap's part, on the native one.
         native: of the native part, on the wrap's.
+        asked: that either has to have; less of a digit on a coarse mesh.
     """
 
     wrap: float
     native: float
+    asked: float = COVERED
 
     @property
     def least(self) -> float:
@@ -112,7 +122,8 @@ def coverage(
     on = (np.linalg.norm(contact.points - wrap, axis=1) <= near) & (turned[contact.faces] | feet)
     counted = ~(inside | contact.open)
     back = Surface(wrap, triangles).closest(surface.vertices)
-    under = np.linalg.norm(back.points - surface.vertices, axis=1) <= near
+    corner = np.clip(_EDGE * _edges_at(surface), near, _AT_MOST * near)
+    under = np.linalg.norm(back.points - surface.vertices, axis=1) <= corner
     corners = triangles[back.faces]
     part = place[np.take_along_axis(corners, back.shares.argmax(1)[:, None], 1)[:, 0]]
     # What lies within the wrap is no skin: teeth, eyeballs, the ends of limbs that are set into a trunk.
@@ -123,6 +134,16 @@ def coverage(
         for i, name in enumerate(names)
         if (counted & (place == i)).any()
     }
+
+
+def _edges_at(surface: Surface) -> np.ndarray:
+    """Mean length (n,) of the edges at each vertex."""
+    ends = unique_edges(triangle_sides(surface.triangles))
+    lengths = np.linalg.norm(np.diff(surface.vertices[ends], axis=1)[:, 0], axis=1)
+    count = len(surface.vertices)
+    return np.bincount(ends.ravel(), np.repeat(lengths, 2), count) / np.maximum(
+        np.bincount(ends.ravel(), minlength=count), 1
+    )
 
 
 def _mean(values: np.ndarray) -> float:
@@ -147,16 +168,20 @@ def matches(wrap: np.ndarray, surface: Surface, digits: Digits, guide: DigitGuid
     triangles = guide.mesh.triangles.astype(np.int64)
     there = surface.facing(wrap, vertex_normals(wrap, triangles))
     here = Surface(wrap, triangles).facing(surface.vertices, surface.normals)
-    found = {}
+    found, edges = {}, _edges_at(surface)
     for limb in (each for each in LIMBS if each in digits.tips):
         own, native = guide.along[limb], digits.along[limb]
         on = _most(native[:, surface.triangles[there.faces]], there.shares)
         by = _most(own[:, triangles[here.faces]], here.shares)
         for digit in range(len(own)):
+            part = wrap[own[digit] > 0]
+            length = np.linalg.norm(part - wrap[guide.tips[limb][digit]], axis=1).max()
+            coarse = edges[native[digit] > 0].mean() / max(length, 1e-12)
             right = (on == digit) | ((on == len(own)) & (own[digit] < _FUSED))
             found[_digit_name(limb, digit)] = Share(
                 wrap=_mean(right[own[digit] > _OUTER]),
                 native=_mean(by[native[digit] > _OUTER] == digit),
+                asked=MATCHED * float(np.clip((_UNTOLD - coarse) / (_UNTOLD - _COARSE), 0, 1)),
             )
     return found
 
@@ -192,13 +217,13 @@ def faults(
     found += [
         f"{name}: {1 - share.wrap:.0%} lies beside its own, of which {1 - share.native:.0%} is without it"
         for name, share in matched.items()
-        if share.least < MATCHED
+        if share.least < share.asked
     ]
     bare = {_digit_name(limb, i) for limb in LIMBS for i in range(5) if (extremities[limb] or 0) <= _MITTEN}
     found += [
         f"{name}: {1 - share.wrap:.0%} is off the mesh, {1 - share.native:.0%} of the mesh there is bare"
         for name, share in covered.items()
-        if share.least < COVERED and name not in bare
+        if share.least < share.asked and name not in bare
     ]
     return tuple(found)
 

@@ -328,6 +328,8 @@ def _skeletons() -> Iterator[tuple[str, bytes]]:
     yield "bvh of infinity", good + b"1e999"
     yield "bvh of text", good + b"0 1,5 abc"
     yield "bvh of one long number", good + b"1" * 2_000_000
+    yield "bvh of a hierarchy of zeros", b"HIERARCHY\n" + bytes(40 << 20)
+    yield "bvh of a number of zeros", good + bytes(40 << 20)
     yield "bvh of many channels", good.replace(b"1 Xrotation", b"1000000000 Xrotation") + b"0"
     yield "bvh of an unknown channel", good.replace(b"Xrotation", b"Wrotation") + b"0"
     yield "bvh of an offset of NaN", good.replace(b"0 0 0", b"0 nan 0") + b"0"
@@ -376,6 +378,10 @@ def _plain() -> Iterator[tuple[str, bytes]]:
     yield "JSON of another kind", b'{"schema": 1, "files": 3}'
     yield "JSON of a list", b"[1, 2]"
     yield "invalid UTF-8", b'{"schema": "\xff\xfe"}'
+    yield "csv of one long line", b"1," * 2_000_000
+    yield "csv of a long cell", b"a_x,a_y,a_z\n" + b"1" * 200_000
+    yield "csv of a head alone", b"a_x,a_y,a_z\n"
+    yield "csv of rows of other lengths", b"1,2,3\n4,5\n"
     yield "point.pca of a huge header", struct.pack("<II", 0xFFFFFFFF, 0xFFFFFFFF) + bytes(100)
     yield "point.pca cut off", struct.pack("<II", 71_256, 15) + bytes(100)
     yield "point.pca big-endian", struct.pack(">II", 71_256, 15) + bytes(100)

@@ -24,6 +24,7 @@ from soma_core.io.data_files import read_torch_arrays
 from soma_core.io.json_frames import read_pose_frames
 from soma_core.io.mesh_vertices import read_mesh_vertices, read_ply_triangles
 from soma_core.io.pickled_arrays import read_pickled_arrays
+from soma_core.io.point_files import read_points
 from soma_core.io.sam3d import read_sam3d
 from soma_core.io.skeleton_files import read_skeleton
 from soma_core.io.smpl_camera import in_world
@@ -255,6 +256,18 @@ def _bvh(path: Path) -> None:
     path.write_text(f"{head}{leg}\n }}\n}}\nMOTION\nFrames: 2\nFrame Time: 0.04\n" + "0 90 0 1 2 3 4\n" * 2)
 
 
+def _points(path: Path) -> np.ndarray:
+    return read_points(path, ("Hips", "Head")).positions
+
+
+def _table(path: Path) -> None:
+    path.write_text("Hips_x,Hips_y,Hips_z,Head_x,Head_y,Head_z\n" + "0,0.9,0,0,1.6,0.05\n" * 2)
+
+
+def _keypoints(path: Path) -> None:
+    path.write_text(json.dumps({"fps": 30, "frames": [{"keypoints": [[0, 0.9, 0, 1], [0, 1.6, 0, 1]]}] * 2}))
+
+
 def _fbx(path: Path) -> None:
     parents, rest = np.array([-1, 0]), np.array([[0, 1.0, 0], [0, 0.5, 0]])
     motion = moved(("Hips", "LeftLeg"), parents, rest, frames=2)
@@ -342,6 +355,8 @@ READERS = [
         good=lambda path: save_joblib(path, {0: wham()[0]}),
     ),
     Reader(name="pose frames", suffix=".json", read=_pose_frames, good=_pose_frame),
+    Reader(name="points of a table", suffix=".csv", read=_points, good=_table),
+    Reader(name="points of frames", suffix=".json", read=_points, good=_keypoints),
     Reader(name="camera of tracks", suffix=".npy", read=_camera, good=_camera_path),
     Reader(name="sam 3d body", suffix=".npz", read=read_sam3d),
     Reader(name="shape space", suffix=".npz", read=load_shape_space, good=_shape_space),

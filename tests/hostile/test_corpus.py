@@ -40,7 +40,7 @@ All others of the format are read by each of its readers, which shows that they 
 
 def files_for(reader):
     """Hostile files of the reader's own format, those of no format, and some of others."""
-    kinds = {*KINDS.values(), "npz", "obj", "ply", "glb", "usda", "usdc", "bvh", "fbx"} - {
+    kinds = {*KINDS.values(), "npz", "obj", "ply", "glb", "usda", "usdc", "bvh", "fbx", "csv"} - {
         KINDS.get(reader.suffix, reader.suffix[1:])
     }
     first = next(other for other in READERS if other.suffix == reader.suffix) is reader

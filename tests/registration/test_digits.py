@@ -25,6 +25,8 @@ from soma_core.rig.landmarks import canonical_landmarks
 
 TIP_M = 0.012  # a tip is the vertex furthest from the wrist, on a coarse mesh another one
 SLID_M = 0.04  # of a face, off a forehead that stays
+FEW_FACES = 2000
+SIDES, LONG = ("Left", "Right"), ("Index", "Middle", "Ring")
 AWAY_M = 0.03  # what a rough fit may be off at wrists and insteps
 
 
@@ -111,6 +113,23 @@ def test_fingers_that_are_one_to_their_middle_are_no_fault(guide, halved) -> Non
     gone = {limb: np.clip(6 * along - 5, 0, None) for limb, along in found.along.items()}
     shares = matches(body, surface, replace(found, along=gone), guide)
     assert max(share.wrap for share in shares.values()) < MATCHED
+
+
+def test_less_is_asked_of_digits_on_a_mesh_of_few_faces(guide, halved) -> None:
+    pyvista = pytest.importorskip("pyvista")
+    surface, body = halved
+    fine = matches(body, surface, guide.find(surface, body), guide)
+    assert {share.asked for share in fine.values()} == {MATCHED}
+    whole = pyvista.PolyData(surface.vertices, np.insert(surface.triangles, 0, 3, axis=1).ravel())
+    few = whole.decimate(1 - FEW_FACES / len(surface.triangles))
+    coarse = Surface(np.asarray(few.points, np.float64), few.faces.reshape(-1, 4)[:, 1:].astype(np.int64))
+    found = guide.find(coarse, body)
+    shares = matches(body, coarse, found, guide)
+    assert all(0 < shares[f"{side}{name}"].asked < MATCHED for side in SIDES for name in ("Index", "Ring"))
+    swapped = replace(found, along={limb: along[[0, 2, 1, 4, 3]] for limb, along in found.along.items()})
+    shares = matches(body, coarse, swapped, guide)
+    said = faults({}, shares, dict.fromkeys(LIMBS, 5))
+    assert all(any(text.startswith(f"{side}{name}: ") for text in said) for side in SIDES for name in LONG)
 
 
 def test_a_face_that_slid_is_found_out(guide) -> None:
