@@ -109,7 +109,7 @@ def coverage(
     """
     triangles = mesh.triangles.astype(np.int64)
     sides = np.linalg.norm(np.diff(wrap[triangle_sides(triangles)], axis=1)[:, 0], axis=1)
-    near = max(_NEAR * np.linalg.norm(np.ptp(wrap, axis=0)), float(np.median(sides)) / 2)
+    near = max(_NEAR * float(np.linalg.norm(np.ptp(wrap, axis=0))), float(np.median(sides)) / 2)
     names, place = _segments(rig)
     contact = surface.closest(wrap)
     # Toes lie folded on a foot or a shoe without any, seen from both sides; `matches` tells them apart.
