@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from soma_core.errors import InputError
+from soma_core.errors import InputError, SomaError
 from soma_core.io.data_files import open_data
 from soma_core.io.humanml3d import joints_of_humanml3d
 from soma_core.io.json_frames import frame_files
@@ -92,12 +92,15 @@ def read_points(
     size = 2 if views else 3
     if views > 1:
         return _of_views(path, names, person, views)
-    if path.is_dir():
-        found = _of_folder(path, person, size)
-    elif path.suffix.lower() == ".csv":
+    if path.suffix.lower() == ".csv":
         found = _of_table(path, size)
-    elif path.suffix.lower() == ".json":
-        found = _of_json(path, person, size)
+    elif path.is_dir() or path.suffix.lower() == ".json":
+        try:
+            found = (_of_folder if path.is_dir() else _of_json)(path, person, size)
+        except (AttributeError, IndexError, KeyError, TypeError, ValueError) as error:
+            if isinstance(error, SomaError):
+                raise
+            raise _no_points(path, "lists and names", "JSON", size) from error
     else:
         found = _of_data(path, size)
     return _ordered(path, found, names)
@@ -292,12 +295,7 @@ def _of_frames(path: Path, frames: Any, person: str | None, size: int) -> PointF
         if isinstance(inner, Mapping) or (inner and isinstance(inner[0], Mapping)):
             people = [_person(path, frame, person, size) for frame in frames]
             return _stacked(path, people, "frames of people", size)
-    try:
-        return _shaped(path, np.array(frames, np.float64), None, None, size)
-    except (TypeError, ValueError) as error:
-        if isinstance(error, InputError):
-            raise
-        raise _no_points(path, type(frames).__name__, "JSON", size) from error
+    return _shaped(path, np.array(frames, np.float64), None, None, size)
 
 
 def _by_image(people: Sequence[Mapping[str, Any]]) -> list[list[Mapping[str, Any]]]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 from collections.abc import Iterator
 from pathlib import Path
+from typing import TextIO
 
 import numpy as np
 
@@ -98,15 +99,19 @@ def table_rows(path: Path) -> Iterator[list[str]]:
     refuse_unreadable(path, most_bytes=_MOST_BYTES)
     try:
         with open(path, newline="", encoding="utf-8-sig") as stream:
-            between = ""
-            while line := stream.readline(_LONGEST):
-                if len(line) == _LONGEST:
-                    raise csv.Error(f"a line of {_LONGEST} letters or more")
-                between = between or max(",;\t", key=line.count)
-                row = next(csv.reader([line], delimiter=between), [])
-                if between != ",":  # where a comma may be that of decimals
-                    row = [cell.replace(",", ".") for cell in row]
-                if any(map(str.strip, row)):
-                    yield row
+            yield from _rows(stream)
     except (csv.Error, UnicodeDecodeError) as error:
         raise AssetError(path, cause=f"not a table of numbers ({error})", fix="Write it again.") from error
+
+
+def _rows(stream: TextIO) -> Iterator[list[str]]:
+    between = ""
+    while line := stream.readline(_LONGEST):
+        if len(line) == _LONGEST:
+            raise csv.Error(f"a line of {_LONGEST} letters or more")
+        between = between or max(",;\t", key=line.count)
+        row = next(csv.reader([line], delimiter=between), [])
+        if between != ",":  # where a comma may be that of decimals
+            row = [cell.replace(",", ".") for cell in row]
+        if any(map(str.strip, row)):
+            yield row

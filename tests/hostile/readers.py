@@ -260,6 +260,10 @@ def _points(path: Path) -> np.ndarray:
     return read_points(path, ("Hips", "Head")).positions
 
 
+def _keypoints(path: Path) -> None:
+    path.write_text(json.dumps({"fps": 30, "frames": [{"keypoints": [[0, 0.9, 0, 1], [0, 1.6, 0, 1]]}] * 2}))
+
+
 def _table(path: Path) -> None:
     path.write_text("Hips_x,Hips_y,Hips_z,Head_x,Head_y,Head_z\n" + "0,0.9,0,0,1.6,0.05\n" * 2)
 
@@ -352,6 +356,7 @@ READERS = [
     ),
     Reader(name="pose frames", suffix=".json", read=_pose_frames, good=_pose_frame),
     Reader(name="points of a table", suffix=".csv", read=_points, good=_table),
+    Reader(name="points of frames", suffix=".json", read=_points, good=_keypoints),
     Reader(name="camera of tracks", suffix=".npy", read=_camera, good=_camera_path),
     Reader(name="sam 3d body", suffix=".npz", read=read_sam3d),
     Reader(name="shape space", suffix=".npz", read=load_shape_space, good=_shape_space),
