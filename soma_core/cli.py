@@ -195,10 +195,11 @@ def _dispatch(arguments: Sequence[str]) -> int:
     if verb in ("-V", "--version"):
         _say(f"soma-body-core {__version__}")
         return EXIT_OK
-    if verb in TASKS:
-        return _run_task(verb, rest)
-    if verb in _VERBS:
-        return _VERBS[verb](rest)
+    if verb in TASKS or verb in _VERBS:
+        from soma_core.plugin.registry import default_registry
+
+        default_registry()  # before PyTorch is imported, which dies of damage that this steps around
+        return _run_task(verb, rest) if verb in TASKS else _VERBS[verb](rest)
     from soma_core.plugin.declaration import did_you_mean
 
     known = [*TASKS, *_VERBS]

@@ -18,6 +18,8 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from typing import Any
 
+from soma_core.plugin.discovery import hide_damaged
+
 __all__ = ["EndedError", "Say", "run_in_child"]
 
 Say = Callable[[Any], None]
@@ -134,6 +136,7 @@ def _child(
         connection.send_bytes(dumps(document).encode())
 
     try:
+        hide_damaged()
         for module in preload:
             importlib.import_module(module)
         run = _named(function)

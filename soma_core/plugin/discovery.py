@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.machinery
 import importlib.metadata
 import importlib.util
 import logging
@@ -22,6 +23,7 @@ __all__ = [
     "Offer",
     "config_folder",
     "find_offers",
+    "hide_damaged",
     "normalised",
     "read_installed",
 ]
@@ -123,9 +125,11 @@ def read_installed() -> tuple[tuple[EntryPointLike, ...], tuple[Damaged, ...]]:
         return tuple(importlib.metadata.entry_points(group=ENTRY_POINT_GROUP)), ()
     except Exception as error:  # whatever a damaged file makes of the standard library's parser
         _log.debug("reading the distributions one by one: %r", error)
-        # PyTorch (2.5 on) looks for device backends in the same way when it is imported, and would die of it:
+        # PyTorch (2.5 on) when it is imported, and Triton at PyTorch's first operator of our own, look for
+        # device backends in the same way, and would die of it:
         # https://docs.pytorch.org/tutorials/unstable/python_extension_autoload.html
-        os.environ.setdefault("TORCH_DEVICE_BACKEND_AUTOLOAD", "0")
+        os.environ["TORCH_DEVICE_BACKEND_AUTOLOAD"] = "0"
+        os.environ["TRITON_BACKENDS_IN_TREE"] = "1"
     points: dict[str, tuple[EntryPointLike, ...]] = {}
     damaged: list[Damaged] = []
     for number, distribution in enumerate(importlib.metadata.distributions()):
@@ -138,6 +142,28 @@ def read_installed() -> tuple[tuple[EntryPointLike, ...], tuple[Damaged, ...]]:
             cause = f"{type(error).__name__}: {' '.join(str(error).split())}"
             damaged.append(Damaged(distribution=name or "a distribution", folder=folder, cause=cause))
     return tuple(point for several in points.values() for point in several), tuple(damaged)
+
+
+def hide_damaged() -> None:
+    """In a process of our own: let no library come upon metadata that cannot be read.
+
+    Triton, NetworkX, fsspec and others read the entry points of all that is installed, and die of one file.
+    """
+    if not read_installed()[1]:
+        return
+    found = importlib.machinery.PathFinder.find_distributions
+
+    def sound(*arguments: Any, **named: Any) -> list[Any]:
+        return [each for each in found(*arguments, **named) if _readable(each)]
+
+    importlib.machinery.PathFinder.find_distributions = sound  # type: ignore[method-assign]
+
+
+def _readable(distribution: importlib.metadata.Distribution) -> bool:
+    try:
+        return all(each is not None for each in (distribution.metadata, distribution.entry_points))
+    except Exception:
+        return False
 
 
 def config_folder(offer: Offer) -> Path | None:

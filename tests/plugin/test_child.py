@@ -50,6 +50,7 @@ HARM = {
     "prints_c": ("module", "import ctypes; ctypes.CDLL(None).puts(b'from C')", ""),
     "prints": ("rest", "import os; os.write(1, b'from below'); print('x', flush=True)", ""),
     "closes": ("declare", "import os; os.close(1); os.close(2)", ""),
+    "reads_others": ("module", "import importlib.metadata as found; found.entry_points()", ""),
     "exit_hook": ("module", "import atexit, os; atexit.register(os.write, 1, b'bye')", ""),
 }
 
@@ -62,21 +63,51 @@ def _body(name: str, place: str, harm: str) -> str:
 
 
 def _soma(site: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
-    names = ["soma", *HARM]
+    return _run(site, "backends", *arguments, names=",".join(["soma", *HARM]))
+
+
+def _run(site: Path, *arguments: str, names: str) -> subprocess.CompletedProcess[str]:
+    path = os.pathsep.join((str(site), str(ROOT)))
     return subprocess.run(
-        [sys.executable, "-c", "from soma_core.cli import console; console()", "backends", *arguments],
-        env=os.environ
-        | {"PYTHONPATH": os.pathsep.join((str(site), str(ROOT))), "SOMA_BACKENDS": ",".join(names)},
+        [sys.executable, "-c", "from soma_core.cli import console; console()", *arguments],
+        env=os.environ | {"PYTHONPATH": path, "SOMA_BACKENDS": names},
         capture_output=True, text=True, check=False, timeout=600,
     )  # fmt: skip
+
+
+def _damage(site: Path) -> None:
+    """Install metadata that cannot be read, and a Triton that reads it once PyTorch asks for it."""
+    broken = Distribution(name="unrelated", distribution="unrelated").write_metadata(site)
+    (broken / "entry_points.txt").write_bytes(b"\xff\xfe[soma_core.backends]\nno value\n")
+    (site / "triton").mkdir()
+    (site / "triton" / "__init__.py").write_text(_TRITON)
+
+
+_TRITON = """
+import importlib.metadata, os
+if os.environ.get("TRITON_BACKENDS_IN_TREE") != "1":
+    importlib.metadata.entry_points()
+raise ImportError("only a stand-in")
+"""
+
+
+@pytest.mark.parametrize("verb", [["backends", "check", "--explain", "finite"], ["assets", "show"]])
+def test_what_needs_no_plugin_steps_around_damage(site: Path, verb: list[str]) -> None:
+    _damage(site)
+    ended = _run(site, *verb, names="toy")
+    assert ended.returncode == 0, ended.stderr
+
+
+def test_a_first_body_steps_around_damage(site: Path) -> None:
+    _damage(site)
+    assert _run(site, "backends", "--load", names="soma").returncode == 0
 
 
 @pytest.mark.slow
 def test_harm_costs_one_row_and_the_listing_stays_json(site: Path) -> None:
     for name, (place, harm, _) in HARM.items():
         Distribution(name=name, body=_body(name, place, harm)).install(site)
-    broken = Distribution(name="unrelated", distribution="unrelated").write_metadata(site)
-    (broken / "entry_points.txt").write_bytes(b"\xff\xfe[soma_core.backends]\nno value\n")
+    _damage(site)
     ended = _soma(site, "--load", "--json", "--timeout", "30")
     rows = {row["name"]: row for row in json.loads(ended.stdout) if row["state"] != "blocked"}
     assert ended.returncode == 3
