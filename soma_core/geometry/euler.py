@@ -21,31 +21,34 @@ def axis_rotation(axis: int, angle: np.ndarray) -> np.ndarray:
     return matrix
 
 
-def matrices_from_euler(angles: np.ndarray, order: str) -> np.ndarray:
+def matrices_from_euler(angles: np.ndarray, order: str, out: np.ndarray | None = None) -> np.ndarray:
     """Product of rotations about the axes of `order`, the first leftmost; [rad] (..., n) -> (..., 3, 3)."""
+    matrix = np.empty((*angles.shape[:-1], 3, 3)) if out is None else out
     if len({*order}) == 3:
-        return _three_axes(angles, order)
-    matrix = np.broadcast_to(np.eye(3), (*angles.shape[:-1], 3, 3))
+        _three_axes(angles, order, matrix)
+        return matrix
+    product = np.broadcast_to(np.eye(3), matrix.shape)
     for place, letter in enumerate(order):
         turn = axis_rotation("XYZ".index(letter), angles[..., place])
-        matrix = turn if place == 0 else matrix @ turn
+        product = turn if place == 0 else product @ turn
+    matrix[...] = product
     return matrix
 
 
-def _three_axes(angles: np.ndarray, order: str) -> np.ndarray:
+def _three_axes(angles: np.ndarray, order: str, matrix: np.ndarray) -> None:
     """The product written out; in an odd order of axes angles count the other way."""
     i, j, k = ("XYZ".index(letter) for letter in order)
-    sine, cosine = np.sin(np.moveaxis(angles, -1, 0)), np.cos(np.moveaxis(angles, -1, 0))
+    angles = np.moveaxis(angles, -1, 0)
+    sine, cosine = np.sin(angles), np.cos(angles)
     (sa, sb, sc), (ca, cb, cc) = sine if (j - i) % 3 == 1 else -sine, cosine
-    matrix = np.empty((*angles.shape[:-1], 3, 3))
+    both, mixed = sa * sb, ca * sb
     matrix[..., i, i], matrix[..., i, j], matrix[..., i, k] = cb * cc, -cb * sc, sb
     matrix[..., j, i], matrix[..., j, j], matrix[..., j, k] = (
-        ca * sc + sa * sb * cc, ca * cc - sa * sb * sc, -sa * cb,
+        ca * sc + both * cc, ca * cc - both * sc, -sa * cb,
     )  # fmt: skip
     matrix[..., k, i], matrix[..., k, j], matrix[..., k, k] = (
-        sa * sc - ca * sb * cc, sa * cc + ca * sb * sc, ca * cb,
+        sa * sc - mixed * cc, sa * cc + mixed * sc, ca * cb,
     )  # fmt: skip
-    return matrix
 
 
 def euler_from_matrices(matrices: np.ndarray, order: str) -> np.ndarray:

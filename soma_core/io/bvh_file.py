@@ -126,9 +126,14 @@ def read_bvh(
     turning = np.array([rotates for channels in tree.channels for _, rotates in channels])
     if angles == "rad":
         rows = np.where(turning, np.degrees(rows), rows)
-    elif frames >= _CLIP and _LEAST < np.abs(rows[:, turning]).max(initial=0) <= 2 * np.pi:
+    elif frames >= _CLIP and _LEAST < _largest(rows)[turning].max(initial=0) <= 2 * np.pi:
         _log.warning("%s: no angle is above 6.28; if they are radians, pass angles=rad", path.name)
     return _motion(path, tree, rows, rate, root)
+
+
+def _largest(rows: np.ndarray) -> np.ndarray:
+    """Largest size of each column."""
+    return np.asarray(np.maximum(rows.max(axis=0), -rows.min(axis=0)))
 
 
 def _hierarchy(path: Path, text: mmap.mmap) -> tuple[_Tree, int]:
@@ -267,14 +272,16 @@ def _pieces(text: mmap.mmap, at: int) -> Iterator[bytes]:
     for start in range(at, len(text), _CHUNK):
         piece = rest + text[start : start + _CHUNK]
         cut = max(piece.rfind(blank) for blank in (b" ", b"\n", b"\t", b"\r"))
-        rest = piece[cut + 1 :] if cut >= 0 and start + _CHUNK < len(text) else b""
-        yield piece[: len(piece) - len(rest)]
+        if cut < 0 or start + _CHUNK >= len(text):
+            cut = len(piece)
+        rest = piece[cut + 1 :]
+        yield piece[:cut]
 
 
 def _parsed(path: Path, piece: bytes) -> np.ndarray:
-    if b"#" in piece or b"//" in piece:
+    if b"#" in piece or b"/" in piece:
         piece = _NOTE.sub(b"", piece)
-    if not piece.strip():
+    if not piece or piece.isspace():
         return np.empty(0)
     try:
         values = numbers_of_text(_with_points(piece))
@@ -353,11 +360,15 @@ def _turns(rows: np.ndarray, count: int, orders: dict[str, list[tuple[int, list[
     """Rotations (frames, joints, 3, 3), for joints of one order of channels at once."""
     rotations = np.empty((len(rows), count, 3, 3))
     for start in range(0, len(rows), _ROWS):
-        block = rows[start : start + _ROWS]
+        block, found = rows[start : start + _ROWS].T, rotations[start : start + _ROWS].swapaxes(0, 1)
         for order, joints in orders.items():
-            angles = np.radians(block[:, [columns for _, columns in joints]])
-            turned = slice(None) if len(joints) == count else [joint for joint, _ in joints]
-            rotations[start : start + _ROWS, turned] = matrices_from_euler(angles, order)
+            angles = block[np.array([columns for _, columns in joints], np.intp).T]  # (axes, joints, frames)
+            angles *= np.pi / 180
+            angles = np.moveaxis(angles, 0, -1)
+            if len(joints) == count:
+                matrices_from_euler(angles, order, found)
+            else:
+                found[[joint for joint, _ in joints]] = matrices_from_euler(angles, order)
     return rotations
 
 
