@@ -7,9 +7,14 @@ from torch import Tensor
 
 from soma_core.errors import InputError
 from soma_core.geometry.torch_func import transformed
+from soma_core.inversion.result import InversionResult
 from soma_core.layer import SomaLayer
+from soma_core.skeleton.identity import Identity
 
-__all__ = ["check_vertices", "check_weights", "refuse_transforms", "refuse_unit_error", "without_gaps"]
+__all__ = [
+    "check_count", "check_vertices", "check_weights", "refuse_gradient", "refuse_transforms",
+    "refuse_unit_error", "without_gaps",
+]  # fmt: skip
 
 _UNIT_FACTORS = (1000.0, 100.0, 10.0, 0.1, 0.01, 0.001)
 
@@ -27,6 +32,26 @@ def check_vertices(vertices: object, count: int, *, fix: str) -> Tensor:
         wanted = "n" if count < 0 else count
         raise InputError("vertices", got=tuple(vertices.shape), expected=f"(frames, {wanted}, 3)", fix=fix)
     return vertices
+
+
+def check_count(vertices: Tensor, identity: Identity, initial: InversionResult | None) -> int:
+    """Number of frames; refuse identities or an earlier result of other frames."""
+    count = len(vertices)
+    if identity.batch_size not in (1, count):
+        raise InputError(
+            "identity",
+            got=f"a batch of {identity.batch_size} for {count} frames",
+            expected=f"a batch of 1 or {count}",
+            fix="Give one identity for the sequence, or one a frame.",
+        )
+    if initial is not None and len(initial.rotations) != count:
+        raise InputError(
+            "initial",
+            got=f"{len(initial.rotations)} frames",
+            expected=f"{count} frames",
+            fix="Give the earlier result of the same frames.",
+        )
+    return count
 
 
 def check_weights(weights: Tensor | None, default: Tensor, frames: int) -> Tensor:
@@ -62,6 +87,16 @@ def refuse_transforms() -> None:
             expected="plain tensors: a fit is a loop with a reverse-mode derivative",
             fix="Fit all frames as one batch, and use torch.autograd.grad or backward().",
         )
+
+
+def refuse_gradient() -> None:
+    """Refuse a gradient through a fit that has none."""
+    raise InputError(
+        "vertices",
+        got="a tensor that requires a gradient",
+        expected="none with robust or temporal terms, whose fit has no derivative here",
+        fix="Pass vertices.detach(), or leave out robust and temporal_strength.",
+    )
 
 
 def refuse_unit_error(scale: Tensor, name: str = "vertices") -> None:

@@ -12,11 +12,12 @@ from torch import Tensor
 
 from soma_core._derived import Derived, own_precision
 from soma_core._inputs import check_bone_scale, check_choice
-from soma_core.errors import InputError
 from soma_core.geometry.constants import constant
 from soma_core.inversion._inputs import (
+    check_count,
     check_vertices,
     check_weights,
+    refuse_gradient,
     refuse_transforms,
     refuse_unit_error,
     without_gaps,
@@ -33,7 +34,7 @@ from soma_core.inversion.refine import clumping
 from soma_core.inversion.result import InversionResult, joined
 from soma_core.inversion.start import cloud_extent
 from soma_core.inversion.targets import Frames, LadderOptions, Skinning, Stage, Targets
-from soma_core.inversion.whole import is_worse, lopsided, of_another_rig, right_vertices
+from soma_core.inversion.whole import FEW, is_worse, lopsided, of_another_rig, right_vertices
 from soma_core.layer import Kernels, SomaLayer
 from soma_core.rig import load_canonical
 from soma_core.skeleton.identity import Identity
@@ -54,10 +55,10 @@ _RESTING_SHARE = 0.015
 """A frame has converged when a step would change it by less than this share of the error that is left: where
 correctives have a fold, the slope never vanishes, and where another rig moved the skin, steps end slowly."""
 
-_AS_GOOD = 1.1
+_AS_GOOD, _NO_OTHER = 1.1, 1.5
 """Mean error of plain skinning over that of the full model, up to which a frame of another rig is told by the
 former: 0.7 to 1.08 on meshes of Anny's own rig. Of what the full model posed, only bodies that are wrong by
-some millimetres come below, and their angles are as good by either."""
+some millimetres come below, and their angles are as good by either. From the second on it is no other rig."""
 
 _COLLAPSED, _LEFT = 0.1, 0.5
 """A joint whose cloud has less than this share of its extent left cannot be determined; nor can one that a
@@ -196,12 +197,7 @@ class PoseInversion(Derived):
         if not (torch.is_grad_enabled() and canonical.requires_grad):
             return result
         if self.options.robust is not None or strength:
-            raise InputError(
-                "vertices",
-                got="a tensor that requires a gradient",
-                expected="none with robust or temporal terms, whose fit has no derivative here",
-                fix="Pass vertices.detach(), or leave out robust and temporal_strength.",
-            )
+            refuse_gradient()
         if self.ladder.plain or not bool(result.plain.any()):
             return self._with_gradient(canonical, frames, result)
         for fit, rows in ((self, ~result.plain), (self.skinned("plain"), result.plain)):
@@ -243,24 +239,12 @@ class PoseInversion(Derived):
         initial: InversionResult | None,
     ) -> Frames:
         """Check what belongs to the frames, and bring it together."""
-        count = len(vertices)
         self.layer.check_identity(identity)
-        if identity.batch_size not in (1, count):
-            raise InputError(
-                "identity",
-                got=f"a batch of {identity.batch_size} for {count} frames",
-                expected=f"a batch of 1 or {count}",
-                fix="Give one identity for the sequence, or one a frame.",
-            )
+        count = check_count(vertices, identity, initial)
         weights = check_weights(weights, self.default_weights, count)
-        user_joints = self.layer.rig.joint_count - 1
-        bone_scale = check_bone_scale(bone_scale, count, user_joints, self.layer.dtype, self.layer.device)
+        kind = self.layer.dtype, self.layer.device
+        bone_scale = check_bone_scale(bone_scale, count, self.layer.rig.joint_count - 1, *kind)
         shared = identity.batch_size == 1 and len(weights) == 1
-        if initial is not None and len(initial.rotations) != count:
-            raise InputError(
-                "initial", got=f"{len(initial.rotations)} frames", expected=f"{count} frames",
-                fix="Give the earlier result of the same frames.",
-            )  # fmt: skip
         return Frames(
             vertices=vertices, identity=identity, weights=weights, bone_scale=bone_scale, initial=initial,
             rest={model: model.prepared(identity, weights) for model in self.ladder.models} if shared else {},
@@ -339,9 +323,24 @@ class PoseInversion(Derived):
         better = plain.mean_error(part.weights) < _AS_GOOD * full.mean_error(part.weights)
         better &= plain.converged | ~full.converged
         plain = replace(plain, determined=plain.determined & full.determined)
-        return result.put(rows[better], plain.part(better))
+        result = result.put(rows[better], plain.part(better))
+        own = plain.mean_error(part.weights) > _NO_OTHER * full.mean_error(part.weights)
+        return self._searched(frames, result, rows[own & ~better])
 
-    def _posed(self, frames: Frames, robust: float | None = None) -> tuple[Pose, Problem]:
+    def _searched(self, frames: Frames, result: InversionResult, rows: Tensor) -> InversionResult:
+        """The result, with limbs searched in frames of no other rig, where they may rest in a wrong place."""
+        if not len(rows):
+            return result
+        part, before = frames.part(rows), result.part(rows)
+        pose, problem = self._posed(replace(part, initial=before), foreign=False)
+        found, _ = self._result(part, pose, problem)
+        found = before.where(~(found.residual < before.residual), found)
+        stuck = lopsided(found.vertex_error, part.weights, found.residual, FEW)
+        return result.put(rows, replace(found, converged=found.converged & ~stuck))
+
+    def _posed(
+        self, frames: Frames, robust: float | None = None, *, foreign: bool = True
+    ) -> tuple[Pose, Problem]:
         """Pose of a chunk of frames, its translation in the world, and the problem that it answers."""
         vertices, _ = without_gaps(frames.vertices, frames.weights, self.layer)
         terms, strength = self.terms, self.priors.temporal_strength
@@ -350,6 +349,7 @@ class PoseInversion(Derived):
         targets = Targets(
             vertices=vertices, identity=frames.identity, weights=frames.weights, terms=terms,
             bone_scale=frames.bone_scale, doubt=self.doubt, rest=frames.rest, robust=robust,
+            foreign=foreign,
         )  # fmt: skip
         return self.ladder(targets, None if frames.initial is None else frames.initial.pose())
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -109,17 +108,6 @@ class PoseModel(SkinModel):
         if self.some is not None:
             weights = weights[:, self.some]
         return self.rest(self.seen(identity), weights)
-
-    def skin_of(self, bones: Sequence[tuple[int, int]]) -> Tensor:
-        """Skin weights (v, L) of joints by twos, with the helpers on them."""
-        structure, columns = self.structure, []
-        joints, parents = structure.joints, structure.parents[structure.joints]
-        for bone in bones:
-            driven = (joints >= self.solver.public_count) & np.isin(parents, bone)
-            held = (np.isin(joints, bone) | driven)[structure.influence_joint]
-            vertex, weight = structure.influence_vertex[held], structure.influence_weight[held]
-            columns.append(np.bincount(vertex, weight, len(structure.fitted)))
-        return torch.as_tensor(np.stack(columns, 1)).to(self.solver.eye)
 
     def frames_on_gpu(self) -> int:
         """Frames that are fitted together on a GPU: as many as it has room for, since more use it better."""

@@ -98,6 +98,7 @@ class Targets:
         rest: moments of the one identity by model, where there is one.
         robust: residuals beyond this, and beyond twice the frame's median, count linearly [m]; None is least
             squares.
+        foreign: some frames may be of another rig, which a fit of plain skinning will tell.
         problems: those already made, by model.
     """
 
@@ -109,6 +110,7 @@ class Targets:
     doubt: TwistDoubt | None
     rest: dict[PoseModel, RestMoments]
     robust: float | None = None
+    foreign: bool = True
     problems: dict[PoseModel, Problem] = field(default_factory=dict)
 
     def problem(self, model: PoseModel) -> Problem:

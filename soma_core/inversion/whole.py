@@ -17,7 +17,7 @@ from soma_core.inversion.refine import Refinement, clumping
 from soma_core.inversion.result import InversionResult
 from soma_core.inversion.targets import LadderOptions, Targets
 
-__all__ = ["WholeFit", "is_worse", "lopsided", "of_another_rig", "right_vertices"]
+__all__ = ["FEW", "WholeFit", "is_worse", "lopsided", "of_another_rig", "right_vertices"]
 
 _ROUNDS, _STEPS = 2, 3
 """How often offsets and limbs' twists are looked at before the descent, and steps on moments after each."""
@@ -58,10 +58,11 @@ _TRIED, _FAR = ((0.2, -0.2), (0.45, -0.45)), (0.8, -0.8, 1.6, -1.6, 2.4, -2.4, 3
 one limb after the other, for what lies on few of the vertices."""
 
 
-_FEW, _THEIRS, _AGAIN, _ANOTHER = 0.25, 0.25, 2, 0.3
-"""A limb may be what is wrong where median over root mean square error is less, and more of the error than
-this share lies on the limb's skin; how often that is looked at. Not where :func:`clumping` is more than the
-last and plain skinning is fitted too: 0.14 to 0.2 where a limb stopped in a wrong place, and see above."""
+FEW, _FEWEST, _ANOTHER, _AGAIN = 0.5, 0.15, 0.3, 2
+"""A limb may be what is wrong where median over root mean square error is less than the first: up to 0.41
+where limbs stopped in a wrong place, 0.9 where noise is left. Not where it is more than the second and
+:func:`clumping` more than the third while another rig is not ruled out: at least 0.17 and 0.33 there, where
+plain skinning is fitted. How often that is looked at."""
 
 _AT_FIRST, _BEST, _HOPELESS, _ARRIVING = 5, 2, (3.0, 1e-4), 0.1
 """Steps from every start of a limb, and how many starts of a frame go on after them: none whose error is that
@@ -82,30 +83,31 @@ def median_distance(distances: Tensor, weights: Tensor) -> Tensor:
     return some.nanmedian(1).values.nan_to_num(0.0)
 
 
-def lopsided(distances: Tensor, weights: Tensor, residual: Tensor) -> Tensor:
+def lopsided(distances: Tensor, weights: Tensor, residual: Tensor, least: float = _LOPSIDED) -> Tensor:
     """Whether what is left of frames lies on few of their vertices, (F,): neither noise nor another rig.
 
     Args:
         distances: vertex errors (F, v) [m].
         weights: (1 or F, v).
         residual: root mean square error (F,) [m].
+        least: median over root mean square error that is enough.
     """
     large = residual > _FAINT
     if not bool(large.any()):
         return large
-    return large & (median_distance(distances, weights) < _LOPSIDED * residual)
+    return large & (median_distance(distances, weights) < least * residual)
 
 
 def of_another_rig(model: PoseModel, problem: Problem, result: InversionResult) -> Tensor:
-    """Numbers of the frames whose error is more than noise, of one piece and not on few of the vertices.
+    """Numbers of the frames whose error is no noise, of one piece and not on few of the vertices.
 
     Args:
         model: that was fitted.
         problem: that was answered.
         result: the answer.
     """
-    large = result.valid & (result.residual > _DOUBTFUL[1])
-    large = large & ~lopsided(result.vertex_error, problem.weights, result.residual)
+    left = result.vertex_error, problem.weights, result.residual
+    large = result.valid & ((result.residual > _DOUBTFUL[1]) | lopsided(*left, FEW)) & ~lopsided(*left)
     rows = torch.nonzero(large).flatten()
     if not len(rows):
         return rows
@@ -173,7 +175,6 @@ class WholeFit:
             variables = coarse.solver.variables.tolist()
             ends = [variables.index(limb.end) for limb in coarse.share.limbs if limb.end in variables]
             self.ends = torch.tensor(ends, device=coarse.solver.variables.device)
-            self.skin = coarse.skin_of([(limb.own, limb.end) for limb in coarse.share.limbs])
 
     def __call__(self, targets: Targets, pose: Pose) -> tuple[Pose, Problem]:
         """The pose, its translation in the world, and the problem of the model.
@@ -188,7 +189,7 @@ class WholeFit:
         pose, clip = self._approached(problem, pose, targets.robust)
         pose, way = self._descended(self.coarse, problem, pose, clip)
         if clip is None:
-            pose = self._searched(problem, pose)
+            pose = self._searched(problem, pose, foreign=targets.foreign)
         if self.coarse is not self.model:
             world = pose.translation + problem.origin
             problem = targets.problem(self.model)
@@ -303,7 +304,7 @@ class WholeFit:
         )  # fmt: skip
         return pose, refinement
 
-    def _searched(self, problem: Problem, pose: Pose) -> Pose:
+    def _searched(self, problem: Problem, pose: Pose, *, foreign: bool) -> Pose:
         """Frames that may rest beside their minimum are tried from other limb twists."""
         share = self.coarse.share
         limbs = [] if share is None else share.free(self._held(problem))
@@ -319,32 +320,29 @@ class WholeFit:
         looked = torch.full_like(energy, torch.inf)
         for _ in range(_AGAIN):  # a frame that nothing helped would be tried from the same places again
             error, looked = (energy / mass).sqrt().where(energy < looked, 0.0), energy
-            for limb, stray in self._stray(problem, pose, limbs, error):
-                far = [([limb], angle) for angle in _FAR]
-                pose, energy = self._tried(problem, pose, energy, stray, far)
+            rows = self._stray(problem, pose, error, foreign=foreign)
+            for limb in limbs:  # each: one that is right may be held where it is by another that is not
+                pose, energy = self._tried(problem, pose, energy, rows, [([limb], angle) for angle in _FAR])
+                rows = rows[(energy[rows] / mass[rows]).sqrt() > _FAINT]
         return pose
 
-    def _stray(
-        self, problem: Problem, pose: Pose, limbs: Sequence[Limb], error: Tensor
-    ) -> list[tuple[Limb, Tensor]]:
-        """Limbs, and frames whose error (F,) [m] lies on few vertices, many of them theirs."""
+    def _stray(self, problem: Problem, pose: Pose, error: Tensor, *, foreign: bool) -> Tensor:
+        """Numbers of the frames whose error (F,) [m] lies on few vertices, as where limbs are wrong."""
         rows = torch.nonzero(error > _FAINT).flatten()
         if not len(rows):
-            return []
-        rows = problem.several(rows)
-        part = problem.part(rows)
-        distances, _ = self.coarse.distances(part, pose.part(rows))
+            return rows
+        many = problem.several(rows)
+        part = problem.part(many)
+        distances, _ = self.coarse.distances(part, pose.part(many))
         assert distances is not None
-        few = median_distance(distances, part.weights) < _FEW * error[rows]
-        energy = torch.where(part.weights > 0, part.weights * distances.square(), 0.0)
-        theirs = energy @ self.skin > _THEIRS * energy.sum(1, keepdim=True)
-        if self.options.skinning == "auto" and bool(few.any()):
-            view = self.coarse.view(part, pose.part(rows))
-            pieces = clumping(self.coarse, view, part.weights.sum(1).expand(len(rows)))
-            few = few & ~((pieces > _ANOTHER) & (error[rows] > _DOUBTFUL[1]))
-        assert self.coarse.share is not None
-        places = [self.coarse.share.limbs.index(limb) for limb in limbs]
-        return [(limb, rows[few & theirs[:, place]]) for limb, place in zip(limbs, places, strict=True)]
+        share = median_distance(distances, part.weights) / error[many]
+        few = share < FEW
+        doubtful = few & (share > _FEWEST) & (error[many] > _DOUBTFUL[1])
+        if foreign and bool(doubtful.any()):
+            view = self.coarse.view(part, pose.part(many))
+            pieces = clumping(self.coarse, view, part.weights.sum(1).expand(len(many)))
+            few = few & ~(doubtful & (pieces > _ANOTHER))
+        return rows[few[: len(rows)]]
 
     def _tried(
         self, problem: Problem, pose: Pose, energy: Tensor, rows: Tensor,
