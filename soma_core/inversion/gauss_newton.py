@@ -50,6 +50,8 @@ class GaussNewton(SkinEquations):
         dtype, device: of the state; float32 reaches 1e-4 mm on a body near the origin.
         warp: run the Warp twin instead of the torch reference.
         driven: joints whose turn follows from the others'; a pose does not hold them.
+        apart: turn each joint in the world by the sum of the steps above it, so that the direction of a bone
+            moves by its own sum alone, however the steps of the joints above it go together. Knows no hinges.
     """
 
     def __init__(
@@ -60,8 +62,10 @@ class GaussNewton(SkinEquations):
         device: torch.device | str,
         warp: bool = False,
         driven: DrivenJoints | None = None,
+        apart: bool = False,
     ) -> None:
         super().__init__(structure, dtype=dtype, device=device, driven=driven)
+        self.apart = apart
         self.kernels = _kernels(structure, driven, dtype, torch.device(device)) if warp else None
 
     def forward(
@@ -181,6 +185,7 @@ class GaussNewton(SkinEquations):
             forced=forced, iterations=iterations,
             damping=(_START_DAMPING, _LOWER, _RAISE, self._least_damping, _MOST_DAMPING),
             longest=LONGEST_STEP, stiffness=HINGE_STIFFNESS, soft=self.soft(terms, target),
+            apart=self.apart,
         )  # fmt: skip
         return Pose(
             relative=relative,
@@ -229,9 +234,17 @@ class GaussNewton(SkinEquations):
 
     def retract(self, pose: Pose, turns: Tensor, step: Tensor) -> Pose:
         """Turn every variable joint by its step, in the axes of its parent, and remove rounding."""
-        n = self.variables
-        local = turns[:, self.parents[n]].transpose(-1, -2) @ step[:, :-1, :, None]
-        moved = cayley(local.squeeze(-1)) @ pose.relative[:, n]
+        n, own = self.variables, step[:, :-1]
+        inner = turns[:, self.parents[n]].mT
+        if self.apart:
+            whole = turns.new_zeros(*turns.shape[:2], 3).index_copy(1, n, own)
+            for index in range(self.level_count):
+                level = getattr(self, f"level_{index}")
+                whole[:, level] += whole[:, self.parents[level]]
+            above = cayley((inner @ whole[:, self.parents[n], :, None]).squeeze(-1))
+            moved = above.mT @ cayley((inner @ whole[:, n, :, None]).squeeze(-1)) @ pose.relative[:, n]
+        else:
+            moved = cayley((inner @ own[..., None]).squeeze(-1)) @ pose.relative[:, n]
         moved = 1.5 * moved - 0.5 * moved @ (moved.transpose(-1, -2) @ moved)
         relative = pose.relative.index_copy(1, n, moved)
         return replace(pose, relative=relative, translation=pose.translation + step[:, -1])

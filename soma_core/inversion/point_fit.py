@@ -52,9 +52,6 @@ _HIPS_PACE = 5.0
 _LASTING = 0.1
 """A joint that is off what is expected stays so for a while [s]: frames within it are no more than one."""
 
-_ROUNDING = 1e-6
-"""Relative to the matrix of the points: what is less is not told from nothing."""
-
 FEWEST = 3
 """A frame with fewer known points is not fitted."""
 
@@ -229,7 +226,7 @@ class PointFit:
 
     def _trusted(self) -> bool:
         """Let points count less that miss by more than noise does; whether that changed anything."""
-        misses = torch.cat([self._misses(one).norm(dim=-1) for one in self.chunks()])
+        misses = self._distances()
         own = trusted(misses * self.sure.sqrt(), max(self.noise, _FIRST_NOISE))
         weights = self.sure * own
         same = torch.allclose(weights, self.every, atol=_SETTLED)
@@ -255,6 +252,11 @@ class PointFit:
         """What points of a chunk miss, (f, P, 3) [m]."""
         return self.model.points(one.rest, *self.model.walk(one.pose, one.rest)) - one.points
 
+    def _distances(self) -> Tensor:
+        """What points miss, (F, P) [m]."""
+        # torch's norm of three numbers that lie apart takes twenty times as long
+        return torch.cat([self._misses(one).square().sum(-1).sqrt() for one in self.chunks()])
+
     def _estimate(self) -> float:
         """Noise of a coordinate [m], from what is left beside the freedom that the points take up."""
         energy = torch.cat([
@@ -269,23 +271,11 @@ class PointFit:
             return _UNKNOWN_NOISE
         return float((energy.mean() / spare).sqrt().clamp(_LEAST_NOISE, _MOST_NOISE))
 
-    def _matrix(self, some: Tensor, noise: float) -> Tensor:
-        """Gauss-Newton matrix (f, 3 n + 3, 3 n + 3) of some frames, float64."""
-        rest, pose = self._rest_of(some), self.pose.part(some)
-        turns, places = self.model.walk(pose, rest)
-        weights = self.weights if len(self.weights) == 1 else self.weights[some]
-        moments = self.model.moments(rest, weights, noise**2)
-        matrix, _ = self.model.solver.normal_equations(turns, places, moments)
-        return matrix.flatten(3, 4).flatten(1, 2).double()
-
     def _taken(self, some: Tensor) -> Tensor:
         """Mean degrees of freedom that the points take up in some frames, while they have their way."""
-        whole = self._matrix(some, _FIRST_NOISE)
-        diagonal = whole.diagonal(dim1=-2, dim2=-1)
-        diagonal += _ROUNDING * diagonal + _ROUNDING * diagonal.mean(1, keepdim=True)
-        factor, _ = torch.linalg.cholesky_ex(whole)
-        share = torch.cholesky_solve(self._matrix(some, 0.0), factor)
-        return share.diagonal(dim1=-2, dim2=-1).sum(1).mean()
+        rows = rows_of((self.points - self.shift)[some], self.every[some], _FIRST_NOISE)
+        fit = PointRows(self.model, self._rest_of(some), rows, smooth=None)
+        return fit.taken(self.pose.part(some)).mean()
 
     def _correct(self) -> None:
         """What twist joints and correctives do to the points, beside plain skinning."""
@@ -312,7 +302,7 @@ class PointFit:
     def result(self, known: Tensor) -> PointResult:
         """What the pose is worth; `known` (F, P) tells which points are."""
         valid = self.valid
-        error = torch.cat([self._misses(one).norm(dim=-1) for one in self.chunks()])
+        error = self._distances()
         mass = self.every.sum(1).clamp_min(1e-12)
         residual = ((self.every * error.square()).sum(1) / mass).sqrt()
         eye = torch.eye(3, dtype=error.dtype, device=error.device)

@@ -90,7 +90,7 @@ class PointModel(torch.nn.Module):
         rows = scipy.sparse.csr_array(np.concatenate([carried.astype(float), ties]))
         structure = skin_structure(replace(rig, weights=rows, procedural=None), np.ones(rows.shape[0], bool))
         self.structure = structure
-        self.solver = GaussNewton(structure, warp=warp, **kind)
+        self.solver = GaussNewton(structure, warp=warp, apart=True, **kind)
         self.joints, self.variables = structure.joints, structure.variables
         self.prior_mean, blocks = prior.of(rig.joint_names)
         row = {int(joint): place for place, joint in enumerate(structure.joints)}

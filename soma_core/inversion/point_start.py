@@ -71,6 +71,46 @@ class PointStart(torch.nn.Module):
             hinge = next(((j, hinges[j]) for j in hinges if parents[j] == joint and centre[j] >= 0), None)
             self.steps.append((int(joint), int(parents[joint]), weight, hinge))
         self.owner = owner
+        self.register_buffer("plan", self._planned(len(owner)).to(model.mean.device), persistent=False)
+
+    def _planned(self, count: int) -> Tensor:
+        """Lists of the kernel, int32, as ``kernels.point_start_wp`` reads them."""
+        slot = {joint: place + 1 for place, (joint, *_) in enumerate(self.steps)}
+        own = {joint: weight for joint, _, weight, _ in self.steps}
+        steps, entries = [], []
+        for joint, above, weight, hinge in self.steps:
+            near, bent = np.flatnonzero(weight >= _FARTHER), hinge is not None and joint > 1
+            end = np.flatnonzero(own.get(hinge[0], np.zeros(0))) if bent else near[:0]
+            middle = self.centre[hinge[0]] if len(end) else -1
+            first, stop = len(entries), len(entries) + len(near)
+            steps.append(
+                [slot.get(above, 0), first, stop, self.centre[joint], middle, stop, stop + len(end), joint]
+            )
+            entries += [(joint, point, weight[point]) for point in near]
+            entries += [(joint, point, own[hinge[0]][point]) for point in end]
+        self.entries = entries
+        plan = [count, len(steps), *np.ravel(steps), *(point for _, point, _ in entries)]
+        return torch.tensor(np.array(plan, np.int32))
+
+    def _by_warp(
+        self, rest: PointRest, points: Tensor, weights: Tensor, at_rest: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """Rotations (F, J, 3, 3) and Hips positions (F, 3) of one identity."""
+        from soma_core.kernels.point_start_wp import begun
+
+        model, joints = self.model, self.model.solver.variables
+        axes = points.new_tensor(
+            np.array([np.zeros(3) if hinge is None else hinge[1] for *_, hinge in self.steps])
+        )
+        own = torch.cat((model.mean[joints].flatten(1), rest.offsets[0, joints], axes), 1)
+        at = torch.tensor([entry[:2] for entry in self.entries], device=points.device)
+        share = points.new_tensor([entry[2] for entry in self.entries])
+        arms = torch.cat((share[:, None], at_rest[0, at[:, 0], at[:, 1]]), 1)
+        numbers = torch.cat(
+            (points.new_tensor([_EXPECTED, _BEND, _SLIGHT, 0.0]), own.flatten(), arms.flatten())
+        )
+        relative = model.mean.repeat(len(points), 1, 1, 1)
+        return relative, begun(self.plan, numbers, points, weights, relative)
 
     def forward(self, rest: PointRest, points: Tensor, weights: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Rotations (F, J, 3, 3), Hips positions (F, 3) [m], sizes (f,) of some frames.
@@ -80,10 +120,20 @@ class PointStart(torch.nn.Module):
             points: targets (F, P, 3) [m], finite.
             weights: (1 or F, P), 0 for points that are not known.
         """
+        at_rest = self._expected(rest)
+        weights = weights.expand(len(points), -1)
+        few = self.warp and len(rest.local) == 1 == len(rest.offsets)
+        turned = self._by_warp if few else self._by_torch
+        some = slice(None, None, max(1, len(points) // _MEASURED))
+        scale = self._scale(points[some], weights[some], at_rest if len(at_rest) == 1 else at_rest[some])
+        return *turned(rest, points, weights, at_rest), scale
+
+    def _by_torch(
+        self, rest: PointRest, points: Tensor, weights: Tensor, at_rest: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """Rotations (F, J, 3, 3) and Hips positions (F, 3)."""
         model, count = self.model, len(points)
         mean = model.mean
-        at_rest = self._expected(rest)
-        weights = weights.expand(count, -1)
         turns = torch.eye(3, dtype=points.dtype, device=points.device).repeat(
             count, model.solver.joint_count, 1, 1
         )
@@ -116,9 +166,7 @@ class PointStart(torch.nn.Module):
         variables = model.solver.variables
         relative = mean.repeat(count, 1, 1, 1)
         relative[:, variables] = turns[:, model.parents[variables]].mT @ turns[:, variables]
-        some = slice(None, None, max(1, count // _MEASURED))
-        scale = self._scale(points[some], weights[some], at_rest if len(at_rest) == 1 else at_rest[some])
-        return relative, hips, scale
+        return relative, hips
 
     def _scale(self, points: Tensor, weights: Tensor, at_rest: Tensor) -> Tensor:
         """Median (f,) over the bones of how far points lie from their joint, beside how far they should.

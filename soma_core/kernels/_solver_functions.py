@@ -59,7 +59,7 @@ def solver_functions(scalar: str, lanes: int, *, shared: bool) -> SimpleNamespac
 
     def move(
         plan: _ids, numbers: real, k: real, s: real, f: real, stiffs: real, soft_count: int, hinge_end: int,
-        longest: number,
+        longest: number, apart: int,
     ): ...  # fmt: skip
 
     def accept(
@@ -181,3 +181,4 @@ class Task:
     soft_count: int
     hinge_end: int
     outcome: int
+    apart: int

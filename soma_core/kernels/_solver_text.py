@@ -324,17 +324,28 @@ MOVE = """
         for (int r = 0; r < 3; r++) w[r] = d[3*r]*e[0] + d[3*r+1]*e[1] + d[3*r+2]*e[2];
         V along = w[0]*x[0] + w[1]*x[1] + w[2]*x[2]; for (int r = 0; r < 3; r++) x[r] = along * w[r];
     }
-    for (int n = driven_count; n < column_count; n++) {
-        V x = -slope[3*n], y = -slope[3*n+1], z = -slope[3*n+2], q = x*x + y*y + z*z, cut;
+    auto cayley = [&](M d, V x, V y, V z, V* m) {
+        V a = d[0]*x + d[3]*y + d[6]*z, b = d[1]*x + d[4]*y + d[7]*z, c = d[2]*x + d[5]*y + d[8]*z;
+        V f = R(2) / (one + a*a + b*b + c*c), fa = f*a, fb = f*b, fc = f*c;
+        m[0] = one - fb*b - fc*c; m[1] = fa*b - fc; m[2] = fa*c + fb;
+        m[3] = fa*b + fc; m[4] = one - fa*a - fc*c; m[5] = fb*c - fa;
+        m[6] = fa*c - fb; m[7] = fb*c + fa; m[8] = one - fa*a - fb*b;
+    };
+    for (int n = column_count - 1; n >= driven_count; n--) {
+        M x = slope + 3*n; V q = x[0]*x[0] + x[1]*x[1] + x[2]*x[2], cut;
         for (int i = 0; i < N; i++) {
             R len = wp::sqrt(((R*)&q)[i]); ((R*)&cut)[i] = R(0.5) * (len > longest ? longest / len : R(1));
         }
-        M d = turns + 9 * parent[n];
-        V a = cut * (d[0]*x + d[3]*y + d[6]*z), b = cut * (d[1]*x + d[4]*y + d[7]*z);
-        V c = cut * (d[2]*x + d[5]*y + d[8]*z);
-        V f = R(2) / (one + a*a + b*b + c*c), fa = f*a, fb = f*b, fc = f*c;
-        V m[9] = {one - fb*b - fc*c, fa*b - fc, fa*c + fb, fa*b + fc, one - fa*a - fc*c, fb*c - fa,
-                  fa*c - fb, fb*c + fa, one - fa*a - fb*b};
+        int above = parent_column[n]; M d = turns + 9 * parent[n];
+        V u0 = -cut*x[0], u1 = -cut*x[1], u2 = -cut*x[2], m[9];
+        if (apart && above >= 0) {
+            M y = slope + 3 * above; V a[9], b[9];
+            u0 += y[0]; u1 += y[1]; u2 += y[2];
+            cayley(d, y[0], y[1], y[2], a); cayley(d, u0, u1, u2, b);
+            for (int r = 0; r < 3; r++) for (int c = 0; c < 3; c++)
+                m[3*r+c] = a[r] * b[c] + a[3+r] * b[3+c] + a[6+r] * b[6+c];
+        } else cayley(d, u0, u1, u2, m);
+        if (apart) { x[0] = u0; x[1] = u1; x[2] = u2; }
         M u = relative + 9 * joint[n]; M o = trial_relative + 9 * joint[n]; V t[9], g[9];
         for (int r = 0; r < 3; r++) for (int k_ = 0; k_ < 3; k_++)
             t[3*r+k_] = m[3*r] * u[k_] + m[3*r+1] * u[3+k_] + m[3*r+2] * u[6+k_];
@@ -359,8 +370,9 @@ ACCEPT = """
         }
         if (*go > R(0.5)) left_over++;
     }
-    #define CHOOSE(a, b, count) for (int i = 0; i < (count); i++) for (int n = 0; n < N; n++) \\
-        if (((R*)&better)[n] > R(0.5)) ((R*)((a) + i))[n] = ((R*)((b) + i))[n];
+    const V half = zero + R(0.5);
+    #define CHOOSE(a, b, count) for (int i = 0; i < (count); i++) \\
+        (a)[i] = better > half ? (b)[i] : (a)[i];
     for (int i = 0; i < 12 * weighted_count; i++) product[i] += residual[i];
     CHOOSE(residual, product, 12 * weighted_count)
     CHOOSE(relative, trial_relative, 9 * all_count)

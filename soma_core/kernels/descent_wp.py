@@ -223,7 +223,7 @@ def _kernel(scalar: str, width: int, *, shared: bool):
                 if draw(plan, numbers, k, s, m, rules) == 0:
                     break
                 if step < task.iterations:
-                    move(plan, numbers, k, s, m, spins, 0, task.hinge_end, rules[11])
+                    move(plan, numbers, k, s, m, spins, 0, task.hinge_end, rules[11], 0)
                     taken(plan, numbers, k, s, m)
             store(s, at[7], at[5], relative_out, wp.int64(at[5]), 0, f, last)
             store(s, at[8], 3, hips_out, wp.int64(3), 0, f, last)

@@ -20,9 +20,9 @@ from soma_core.kernels._lanes import (
 from soma_core.kernels._native import native, transposing
 from soma_core.kernels._runtime import as_warp, scalar_name
 
-__all__ = ["nearest_rotation"]
+__all__ = ["NEWTON_STEPS", "nearest_functions", "nearest_rotation"]
 
-_NEWTON_STEPS = 9
+NEWTON_STEPS = 9
 """As many as the reference takes."""
 
 _FLOORS = {"float32": (1e-24, 1e-30, 1e-30), "float64": (math.ulp(0.0) ** 0.5, 1e-100, 1e-200)}
@@ -31,10 +31,10 @@ _FLOORS = {"float32": (1e-24, 1e-30, 1e-30), "float64": (math.ulp(0.0) ** 0.5, 1
 
 @functools.cache
 def _kernel(scalar: str, lanes: int):
-    width, number, steps = lanes, getattr(wp, scalar), _NEWTON_STEPS
+    width, number, steps = lanes, getattr(wp, scalar), NEWTON_STEPS
     real, rows = wp.array(dtype=number), wp.array3d(dtype=number)
     (load, store), row = transposing(scalar, lanes), row_of(scalar)
-    shift, polar, checked = (_native(one, real, scalar, lanes) for one in ("shift", "polar", "checked"))
+    shift, polar, checked = nearest_functions(scalar, lanes)
     module = wp.get_module(f"soma_nearest_rotation_{scalar}_{lanes}")
 
     @wp.kernel(module=module, enable_backward=False)
@@ -50,6 +50,14 @@ def _kernel(scalar: str, lanes: int):
             store(matrix, 0, 9, out, wp.int64(9), 0, g * width, count - 1)
 
     return nearest
+
+
+@functools.cache
+def nearest_functions(scalar: str, lanes: int) -> tuple[wp.Function, wp.Function, wp.Function]:
+    """Functions that turn a covariance into its rotation: before, of and after the Newton steps."""
+    real = wp.array(dtype=getattr(wp, scalar))
+    shift, polar, checked = (_native(one, real, scalar, lanes) for one in ("shift", "polar", "checked"))
+    return shift, polar, checked
 
 
 def _native(name: str, real, scalar: str, lanes: int) -> wp.Function:

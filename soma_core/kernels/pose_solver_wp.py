@@ -72,7 +72,7 @@ def _kernel(scalar: str, lanes: int, *, shared: bool):
                     terms(plan, numbers, k, s, m, softs, stiffs, own, count, hinge_end, stiffness, 0)
                     factor(plan, numbers, k, s, m)
                     solve(plan, numbers, k, s, m)
-                    move(plan, numbers, k, s, m, stiffs, count, hinge_end, longest)
+                    move(plan, numbers, k, s, m, stiffs, count, hinge_end, longest, task.apart)
                 walk(plan, numbers, k, s, m, 1)
                 change(plan, numbers, k, s, m, wp.where(step == 0, 1, 0))
                 if step == 0:
@@ -166,7 +166,7 @@ class PoseSolver:
         self, constants: tuple[Tensor, bool], target: Tensor, relative: Tensor, hips: Tensor,
         threshold: Tensor,
         mass: Tensor, *, forced: bool, iterations: int, damping: tuple[float, ...], longest: float,
-        stiffness: float, soft: Soft,
+        stiffness: float, soft: Soft, apart: bool = False,
     ) -> tuple[Tensor, Tensor, Tensor, Tensor]:  # fmt: skip
         """Rotations (F, J, 3, 3), Hips (F, 3) [m], accepted steps (F,), last change of the energy (F,) [m^2].
 
@@ -177,7 +177,7 @@ class PoseSolver:
             threshold: (F,) a frame is done when a step changes its energy by less [m^2].
             mass: (F,) sums of the vertex weights.
             iterations, damping (start, lower, raise, least, most), longest [rad],
-            stiffness: as in the torch twin.
+            stiffness, apart: as in the torch twin.
             soft: terms.
         """
         outputs = [
@@ -194,7 +194,7 @@ class PoseSolver:
             kernel, constants[0], like,
             (*given, as_warp(numbers), longest, stiffness, *map(as_warp, frames), *map(as_warp, outputs)),
             task={"iterations": iterations, "forced": int(forced), "soft_count": len(soft.columns),
-                  "hinge_end": self.columns if soft.hinged else self.driven},
+                  "hinge_end": self.columns if soft.hinged else self.driven, "apart": int(apart)},
         )  # fmt: skip
         return tuple(outputs)
 

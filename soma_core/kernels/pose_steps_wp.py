@@ -119,7 +119,7 @@ def step_kernels(scalar: str, lanes: int, *, shared: bool) -> SimpleNamespace:
             enter(plan, numbers, k, s, m, at, f, last, relative, hips)
             load(step, wp.int64(at[17]), 0, at[17], f, last, s, at[16])
             keep(plan, numbers, k, s, m)
-            move(plan, numbers, k, s, m, stiffs, 0, task.hinge_end, longest)
+            move(plan, numbers, k, s, m, stiffs, 0, task.hinge_end, longest, task.apart)
             store(s, at[0], at[5], relative_out, wp.int64(at[5]), 0, f, last)
             store(s, at[1], 3, hips_out, wp.int64(3), 0, f, last)
 

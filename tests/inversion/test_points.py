@@ -286,3 +286,11 @@ def test_gradients_are_those_of_the_fit(
     step = 1e-1 if views else 1e-4  # px, m
     measured = (told(points + step * way) - told(points - step * way)) / (2 * step)
     torch.testing.assert_close((slope * way).sum(), measured, rtol=2e-3, atol=1e-3)
+
+
+def test_turns_that_points_leave_open_arrive_where_they_are_cheapest():
+    points = LAYER.points(LAYER.joints(IDENTITY, _poses(64)), "smpl22")
+    inversion = PointInversion(LAYER, "smpl22", noise=3e-4)
+    found = inversion(points, IDENTITY)
+    again = inversion(points, IDENTITY, initial=found)
+    assert _angle(found.rotations, again.rotations).amax(1).quantile(0.9) < 1
