@@ -35,7 +35,7 @@ def _parser() -> argparse.ArgumentParser:
         each.set_defaults(verb=verb)
         each.add_argument("name", metavar="NAME", help="a point set, or the path of a JSON file")
     show.add_argument("--json", action="store_true", help="as a JSON file of one's own begins")
-    show.add_argument("--picture", type=Path, metavar="FILE.png", help="draw it on a body")
+    show.add_argument("--picture", type=Path, metavar="FILE.png", help="draw it on a body (.png, .webp)")
     show.add_argument("--backend", default="soma", help="whose body is drawn (default: %(default)s)")
     return parser
 
