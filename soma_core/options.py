@@ -219,9 +219,11 @@ class PriorChoice(Options):
     """Soft terms [m/rad]: limits of joints [rad], a rest pose, smooth motion; hinges: elbows and knees.
 
     `untwist` is a factor on how much twists of elbows, knees and fingers are in doubt; 0 turns that off.
+    `expected` is one on how firmly joints are held near the turns that a file tells.
     """
 
     untwist: float = 1.0
+    expected: float = 1.0
     limits: dict[str, float] = field(default_factory=dict)
     limit_strength: float = 0.05
     hinges: bool = False

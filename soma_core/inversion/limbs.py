@@ -230,7 +230,9 @@ class TwistShare:
         angle = torch.linspace(-math.pi, math.pi, _SHARES).to(pose.relative)
         if near:
             angle = angle[(_SHARES - _SHARES_NEAR) // 2 :][:_SHARES_NEAR]
-        if steps is not None and constants is not None and view.activity is not None:
+        terms, ends = problem.terms, {limb.end for limb in self.limbs}
+        pulled = ends.intersection(() if terms is None else terms.pulled(variables))
+        if steps is not None and constants is not None and view.activity is not None and not pulled:
             doubts = self._limb_doubts(doubt, variables)
             return self._by_warp(pose, view, rest, scale, angle, doubts, held, steps, constants)
         relative = pose.relative.clone()
@@ -238,9 +240,13 @@ class TwistShare:
             energy = self._skin(limb, angle, view, rest) + self._moves(
                 limb, angle, pose.relative, view, scale
             )
+            turned = axis_angle_to_matrix(-angle[:, None] * limb.axis) @ pose.relative[:, limb.end, None]
             if doubt is not None:
-                change = self._doubts(limb, angle, pose.relative, doubt, variables)
+                change = self._doubts(limb, turned, pose.relative, doubt, variables)
                 energy = energy + view.energy[:, None] * change
+            if terms is not None and limb.end in pulled:
+                mass = rest.own[..., 3, 3].sum(1)[:, None]
+                energy = energy + mass * terms.single(variables == limb.end, turned)
             self.turn(relative, limb, _lowest(angle, energy))
         return replace(pose, relative=relative)
 
@@ -316,18 +322,15 @@ class TwistShare:
         return energy + jumping * (_DEAR**2 * rest.own[..., 3, 3].sum(1))[:, None]
 
     def _doubts(
-        self, limb: Limb, angle: Tensor, relative: Tensor, doubt: TwistDoubt, variables: Tensor
+        self, limb: Limb, turned: Tensor, relative: Tensor, doubt: TwistDoubt, variables: Tensor
     ) -> Tensor:
-        """Change (F, a) of the doubt of the next joint's twist."""
-        which = torch.nonzero(variables[doubt.variable] == limb.end).flatten()
+        """Change (F, a) of the doubt of the next joint's twist at its rotations (F, a, 3, 3)."""
+        which = torch.nonzero(variables[doubt.variable] == limb.end).flatten()[:1]
         if not len(which):
-            return relative.new_zeros(len(relative), len(angle))
-        turn = axis_angle_to_matrix(-torch.cat((angle, angle[:1] * 0))[:, None] * limb.axis)
-        turned = (turn @ relative[:, limb.end, None]).flatten(0, 1)[:, None]  # (F (a + 1), 1, 3, 3)
-        first = which[:1]
-        one = replace(doubt, variable=first * 0, axis=doubt.axis[first], square=doubt.square[first])
-        share = one.share(turned).view(len(relative), len(angle) + 1)
-        return share[:, :-1] - share[:, -1:]
+            return relative.new_zeros(turned.shape[:2])
+        one = replace(doubt, variable=which * 0, axis=doubt.axis[which], square=doubt.square[which])
+        still = one.share(relative[:, limb.end, None])
+        return one.share(turned.flatten(0, 1)[:, None]).view(turned.shape[:2]) - still[:, None]
 
     def _twists(self, limb: Limb, angle: Tensor, view: View, rest: RestMoments) -> tuple[Tensor, Tensor]:
         """Twists (F, a, 2) of the bone and of the next one when the bone turns by each `angle` (a,).

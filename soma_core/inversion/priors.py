@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -20,6 +20,7 @@ __all__ = [
     "JointTerms",
     "PosePriors",
     "TwistDoubt",
+    "expected_terms",
     "hinge_rotation",
     "joint_terms",
     "neighbour_mean",
@@ -52,6 +53,12 @@ and how much a twist is in doubt [1/rad]. Elbows and knees, of whose twist skin 
 fingers."""
 
 
+_EXPECTED = {"Hips": 0.0, "ForeArm": 4e-3, "Shin": 4e-3}
+_EXPECTED_FINGER, _EXPECTED_PALM, _EXPECTED_OTHER = 2e-4, 4e-4, 1e-3
+"""How firmly joints are held near turns that are expected of them [m/rad]: elbows and knees above what the
+share of a limb's twist changes of skin, all of them far below what skin tells of a bend."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class PosePriors:
     """What is known of a pose besides its vertices.
@@ -69,6 +76,8 @@ class PosePriors:
     Attributes:
         untwisted: joint name -> axis and doubt, as in ``UNTWISTED``.
         untwist: factor on every doubt; 0 turns them off.
+        expected: factor on how firmly joints are held near turns that a file tells, see
+            ``GuidedInversion``; 0 leaves these out.
         limits: joint name -> largest angle from the T-pose [rad]; beyond it `limit_strength` pulls back.
         limit_strength: [m/rad].
         hinges: joint name -> axis in the world of the T-pose; the joint turns about it alone. ``HINGES`` has
@@ -82,6 +91,7 @@ class PosePriors:
         default_factory=lambda: UNTWISTED
     )
     untwist: float = 1.0
+    expected: float = 1.0
     limits: Mapping[str, float] = field(default_factory=dict)
     limit_strength: float = 0.05
     hinges: Mapping[str, tuple[float, float, float]] = field(default_factory=dict)
@@ -112,6 +122,20 @@ class JointTerms:
         """Sum of the terms (F,) at rotations (F, n, 3, 3) of the variable joints."""
         _, over, _ = self._deviation(rotations)
         return (self.stiffness * over * over).sum(1)
+
+    def pulled(self, variables: Tensor) -> list[int]:
+        """Those of the joints `variables` (n,) that a term pulls."""
+        return list(variables[self.variable[self.stiffness > 0]].tolist())
+
+    def single(self, chosen: Tensor, rotations: Tensor) -> Tensor:
+        """Sum of the terms (F, a) on the variable joint that is `chosen` (n,), at rotations (F, a, 3, 3)."""
+        which = torch.nonzero(chosen[self.variable]).flatten()
+        reference = self.reference[:, which].expand(len(rotations), -1, 3, 3)
+        one = replace(
+            self, variable=which * 0, stiffness=self.stiffness[which], free=self.free[which],
+            reference=reference.repeat_interleave(rotations.shape[1], 0),
+        )  # fmt: skip
+        return one.energy(rotations.flatten(0, 1)[:, None]).view(rotations.shape[:2])
 
     def normal_equations(self, rotations: Tensor, above: Tensor) -> tuple[Tensor, Tensor]:
         """Gauss-Newton blocks (F, n, 3, 3) and half gradients (F, n, 3) by world turns of the joints.
@@ -240,7 +264,7 @@ def joint_terms(
     Raises:
         InputError: a joint that no fit can determine, an axis of no length, a negative strength.
     """
-    for key in ("limit_strength", "rest_strength", "temporal_strength"):
+    for key in ("limit_strength", "rest_strength", "temporal_strength", "expected"):
         if getattr(priors, key) < 0:
             raise InputError(f"priors.{key}", got=getattr(priors, key), expected="at least 0", fix="Use 0.")
     strength = priors.limit_strength
@@ -267,12 +291,15 @@ def joint_terms(
     )
 
 
-def with_references(terms: JointTerms | None, reference: Tensor, strength: float) -> JointTerms:
+def with_references(
+    terms: JointTerms | None, reference: Tensor, strength: float | Sequence[float]
+) -> JointTerms:
     """Add a pull of every variable joint to rotations of its own in every frame, (F, n, 3, 3)."""
     frames, count = reference.shape[:2]
+    strengths = reference.new_tensor([strength] * count if isinstance(strength, float) else strength)
     new = JointTerms(
         variable=torch.arange(count, device=reference.device),
-        stiffness=reference.new_full((count,), strength**2),
+        stiffness=strengths**2,
         free=reference.new_zeros(count),
         reference=reference,
         hinge_axis=reference.new_zeros(count, 3),
@@ -286,6 +313,21 @@ def with_references(terms: JointTerms | None, reference: Tensor, strength: float
         reference=torch.cat((terms.reference.expand(frames, -1, 3, 3), reference), 1),
         hinge_axis=terms.hinge_axis,
     )
+
+
+def expected_terms(
+    terms: JointTerms | None, expected: Tensor, names: Sequence[str], factor: float
+) -> JointTerms:
+    """Add a faint pull to expected rotations (F, n, 3, 3) of the variable joints `names`."""
+    return with_references(terms, expected, [factor * _expected(name) for name in names])
+
+
+def _expected(name: str) -> float:
+    """Strength [m/rad] for a joint."""
+    part = name.removeprefix("Left").removeprefix("Right")
+    if part.startswith("Hand") and part[-1].isdigit():
+        return _EXPECTED_PALM if part[-1] == "1" and "Thumb" not in part else _EXPECTED_FINGER
+    return _EXPECTED.get(part, _EXPECTED_OTHER)
 
 
 def neighbour_mean(rotations: Tensor, valid: Tensor) -> Tensor:

@@ -33,8 +33,11 @@ from soma_core.motion.smpl_input import SMPL_LAYOUTS
 from soma_core.progress import progress
 
 if TYPE_CHECKING:
+    from torch import Tensor
+
     from soma_core.inversion import PoseInversion
     from soma_core.inversion.report import InversionReport
+    from soma_core.inversion.result import InversionResult
     from soma_core.motion.posed_input import PosedInput
     from soma_core.skeleton.identity import Identity
 
@@ -185,9 +188,17 @@ class FitJob:
             start, stop = chunks.ranges[number]
             begin, end = max(start - margin, 0), min(stop + margin, chunks.frame_count)
             vertices = torch.as_tensor(posed.read(begin, end)).to(layer.device, layer.dtype)
-            result = inversion(vertices, self.identity, topology=posed.topology)
+            result = self._fitted(vertices, begin, end)
             result = result.part(slice(start - begin, stop - begin))
             chunks.save(number, chunk_arrays(result, layer, start=start, kept=kept, apart=self._apart))
+
+    def _fitted(self, vertices: Tensor, begin: int, end: int) -> InversionResult:
+        """The fit of frames from `begin` to `end`, near the turns that their file tells."""
+        inversion, topology = self.body.backend.inversion, self.body.posed.topology
+        if self.body.expected is None:
+            return inversion(vertices, self.identity, topology=topology)
+        expected = torch.as_tensor(self.body.expected[begin:end])
+        return inversion.guided(vertices, self.identity, expected, topology=topology)
 
     def fit_missing(self) -> None:
         """Fit the chunks that are not there yet."""

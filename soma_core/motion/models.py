@@ -16,7 +16,7 @@ from torch import Tensor
 
 from soma_core.backends.parameters import batch_parameters
 from soma_core.errors import InputError
-from soma_core.inversion import PoseInversion
+from soma_core.inversion.guided import GuidedInversion
 from soma_core.inversion.options import inversion_options
 from soma_core.io.vertex_sequence import UpAxis, VertexSequence
 from soma_core.layer import SomaLayer
@@ -68,7 +68,7 @@ class FitBackend:
     """A layer, the fit on it, and the model's own poses."""
 
     layer: SomaLayer
-    inversion: PoseInversion
+    inversion: GuidedInversion
 
     def posed(self, params: Mapping[str, Tensor], pose: Mapping[str, Tensor]) -> Tensor:
         """The model's own posed vertices; what goes wrong inside names the backend."""
@@ -158,7 +158,7 @@ class FitBackends:
             layer, choice = open_layer(self._options, name, options), asdict(self._options.inversion)
             kernels = str(choice.pop("kernels"))
             with under(InversionChoice, "inversion"):
-                inversion = PoseInversion(layer, **inversion_options(choice), kernels=kernels)
+                inversion = GuidedInversion(layer, **inversion_options(choice), kernels=kernels)
             self._made[key] = FitBackend(layer=layer, inversion=inversion)
         return self._made[key]
 

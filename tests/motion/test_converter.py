@@ -27,8 +27,7 @@ FIT_MM = 3.0
 """Mean distance of a fit to the stand-in, whose pose blend shapes are noise of about that size."""
 
 CARRIED_DEGREES = 15.0
-"""Angle of a limb that is carried over to the same limb fitted, in most frames: what rest poses leave open.
-The noise turns an upper arm about its bone in single frames, 2 of 60 by more than 60 degrees."""
+"""Angle of a limb that is carried over to the same limb fitted, in any frame: what rest poses leave open."""
 
 Z_UP_TO_Y_UP = np.array([[1, 0, 0], [0, 0, 1], [0, -1, 0]])
 
@@ -231,10 +230,10 @@ def test_without_the_model_the_joints_are_carried_over(
         skeleton = soma_skeleton(each, load_canonical("low")[1])
         worlds.append(skeleton.turns())
     cosine = (np.einsum("fjab,fjab->fj", *worlds) - 1) / 2
-    apart = np.median(np.degrees(np.arccos(cosine.clip(-1, 1))), axis=0)
+    apart = np.degrees(np.arccos(cosine.clip(-1, 1)))
     limbs = [
         USER_JOINTS.index(side + part)
         for side in ("Left", "Right")
         for part in ("Arm", "ForeArm", "Leg", "Shin")
     ]
-    assert apart[limbs].max() < CARRIED_DEGREES
+    assert apart[:, limbs].max() < CARRIED_DEGREES
