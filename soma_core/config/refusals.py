@@ -27,6 +27,8 @@ __all__ = ["REFUSALS", "check_backend_choice", "in_our_words", "with_settings"]
 REFUSALS = (HydraException, InterpolationResolutionError, YAMLError, UnicodeError)
 """What composing a configuration may raise."""
 
+_RUN_FOLDER = "The folder of this run is named by hydra.run.dir=FOLDER"
+
 _SHOWN_KEYS = 16
 """A backend may have hundreds of parameters; an error message lists this many."""
 
@@ -163,16 +165,19 @@ def _broken_file(file: str, cause: str) -> SomaError:
 def _refused_value(cause: OmegaConfBaseException) -> InputError:
     """Name the full key of an unknown key or a value of the wrong type."""
     name = str(cause.full_key or cause.key)
-    if not isinstance(cause, ConfigKeyError | ConfigAttributeError):
-        return _wrong_type(name, _first_line(cause))
     parent, _, key = name.rpartition(".")
+    if not isinstance(cause, ConfigKeyError | ConfigAttributeError):
+        group = cause.parent_node.get(key) if isinstance(cause.parent_node, DictConfig) else None
+        return _wrong_type(name, _first_line(cause), list(group) if isinstance(group, DictConfig) else [])
     known = [str(item) for item in cause.parent_node or () if item != "hydra"]
     shown = known[:_SHOWN_KEYS] + [f"{len(known) - _SHOWN_KEYS} more"] * (len(known) > _SHOWN_KEYS)
     return InputError(
         name,
         got="an unknown key",
         expected=f"one of {', '.join(shown) or 'no keys'}" + (f" in {parent}" if parent else ""),
-        fix=_elsewhere(key, cause.parent_node) or did_you_mean(key, known) or "See --help",
+        fix=_RUN_FOLDER
+        if name == "out"
+        else _elsewhere(key, cause.parent_node) or did_you_mean(key, known) or "See --help",
     )
 
 
@@ -190,8 +195,13 @@ def _elsewhere(key: str, config: object, prefix: str = "") -> str:
     return ""
 
 
-def _wrong_type(name: str, text: str) -> InputError:
-    """Take OmegaConf's sentence apart into got and expected."""
+def _wrong_type(name: str, text: str, keys: list[object]) -> InputError:
+    """Take OmegaConf's sentence apart into got and expected; `keys` are those of a group of settings."""
+    whole = re.search(r"is not a subclass of \w+\. value: (.*)", text)
+    if whole and keys:
+        named = ", ".join(f"{name}.{key}" for key in keys)
+        fix = f"Write {name}.{keys[0]}=VALUE, or another of them"
+        return InputError(name, got=whole[1], expected=f"its settings one by one: {named}", fix=fix)
     for separator in (", expected ", " could not be converted to "):
         got, found, expected = text.partition(separator)
         if found:

@@ -117,6 +117,8 @@ def test_strict_lets_the_error_of_a_task_through(run: Run, monkeypatch: pytest.M
         ("width=3", 'Did you mean "picture.width"?'),
         ("shape=[1]", 'Did you mean "backend.params.shape"?'),
         ("bakend=soma", "bakend: got an unknown key, expected one of backend, backends, motion"),
+        ("out=here", "The folder of this run is named by hydra.run.dir=FOLDER"),
+        ("frames=0:3", "frames: got 0:3, expected its settings one by one: frames.start, frames.stop"),
         ("lod=big", "lod: got invalid value 'big', expected one of [mid, low, xlo]"),
         ("write=[npz,uds]", "write[1]: got invalid value 'uds', expected one of [npz, usd, glb, html, png,"),
         ("picture.width=wide", "picture.width: got value 'wide' of type 'str', expected Integer"),
