@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import importlib
+import logging
 import os
 import sys
 import warnings
@@ -14,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 from soma_core._version import __version__
 from soma_core.errors import InputError, SomaError
+from soma_core.progress import PrintableFormatter, printable
 from soma_core.tasks import EXIT_BACKEND, EXIT_FAILED, EXIT_OK, EXIT_USAGE, exit_code
 
 if TYPE_CHECKING:
@@ -81,12 +83,12 @@ TASKS = {
 
 
 def _say(text: str) -> None:
-    sys.stdout.write(text + "\n")
+    sys.stdout.write(printable(text) + "\n")
     sys.stdout.flush()
 
 
 def _complain(text: str) -> None:
-    sys.stderr.write(f"soma: {text}\n")
+    sys.stderr.write(printable(f"soma: {text}\n"))
 
 
 def _usage() -> str:
@@ -239,8 +241,8 @@ def _warning_text(
     from soma_core.plugin.errors import BackendWarning
 
     if issubclass(category, BackendWarning):
-        return f"soma: {message}\n"
-    return _PYTHON_WARNING_TEXT(message, category, filename, lineno, line)
+        return printable(f"soma: {message}\n")
+    return printable(_PYTHON_WARNING_TEXT(message, category, filename, lineno, line))
 
 
 _PYTHON_WARNING_TEXT = warnings.formatwarning
@@ -249,6 +251,8 @@ _PYTHON_WARNING_TEXT = warnings.formatwarning
 def console() -> None:
     """Entry point of the console script."""
     warnings.formatwarning = _warning_text
+    if logging.lastResort:
+        logging.lastResort.setFormatter(PrintableFormatter("%(message)s"))
     try:
         code: int | str | None = main(sys.argv[1:])
     except SystemExit as stop:  # hydra and argparse end the process once they have printed their help

@@ -1,13 +1,19 @@
-"""What is asked of every file before it is read: that it is one, that it is there, and its size."""
+"""What is asked of every file: that it is one and there, its size, and places that a body can have."""
 
 from __future__ import annotations
 
 import stat
 from pathlib import Path
 
+import numpy as np
+
 from soma_core.errors import AssetError
 
-__all__ = ["refuse_unreadable"]
+__all__ = ["FARTHEST", "refuse_far", "refuse_unreadable"]
+
+FARTHEST = 1e9
+"""Largest coordinate that is taken, in any unit: a thousand kilometres in millimetres. Squares of larger ones
+leave what numbers hold."""
 
 _LFS = b"version https://git-lfs"
 _HEAD = 64
@@ -60,3 +66,18 @@ def refuse_unreadable(
         cause = f"holds {found.st_size} bytes, more than the {most_bytes} that such a file can have"
         raise AssetError(path, cause=cause, fix="Check that it is the right file.")
     return head
+
+
+def refuse_far(path: Path | str, places: np.ndarray, what: str = "vertex") -> None:
+    """Refuse coordinates (..., 3) where no body is; NaN, which marks a missing vertex, passes.
+
+    Raises:
+        AssetError: one is infinite or above :data:`FARTHEST`; `what` it is, and its number.
+    """
+    largest, least = places.max(initial=0), places.min(initial=0)
+    if largest <= FARTHEST and least >= -FARTHEST:
+        return
+    far = np.argwhere(np.abs(places) > FARTHEST)
+    if len(far):
+        cause = f"{what} {far[0][-2] if places.ndim > 1 else 0} lies at {places[tuple(far[0])]:.3g}"
+        raise AssetError(path, cause=f"damaged ({cause}, where no body is)", fix="Export it again.")

@@ -22,9 +22,9 @@ _DAMAGE = (*ARCHIVE_DAMAGE, SyntaxError)
 
 _LONGEST_HEADER = 10_000  # as numpy itself
 _BLOCK = 2**20
-_SMALL = 256 * 2**20
+_SMALL = 128 * 2**20
 _MOST_EXPANSION = 64
-"""Times its size that a large file may unfold to; zeros reach 1,000, motion and meshes 2 to 10."""
+"""Times its size that a large array may unfold to; zeros reach 1,000, motion and meshes 2 to 10."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -73,6 +73,11 @@ def read_array_header(stream: IO[bytes], *, objects: bool = False) -> ArrayHeade
     return ArrayHeader(shape=shape, dtype=dtype, fortran=fortran, begin=stream.tell())
 
 
+def _most(info: zipfile.ZipInfo) -> int:
+    """Bytes that a member may unfold to."""
+    return max(_SMALL, _MOST_EXPANSION * info.compress_size)
+
+
 class NpzFile:
     """The named arrays of one NPZ file, read on demand."""
 
@@ -80,7 +85,6 @@ class NpzFile:
         self.path = path
         self._archive = archive
         self._members = {info.filename.removesuffix(".npy"): info for info in archive.infolist()}
-        self._most = max(_SMALL, _MOST_EXPANSION * path.stat().st_size)
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -108,10 +112,9 @@ class NpzFile:
             if header.begin + header.byte_count != info.file_size:
                 stored = info.file_size - header.begin
                 raise ValueError(f"{stored} bytes for the shape {header.shape} of {header.dtype}")
-            if header.byte_count > self._most:
+            if header.byte_count > (most := _most(info)):
                 raise ValueError(
-                    f"{header.byte_count} bytes in a file of {self.path.stat().st_size}; "
-                    f"at most {self._most} are read"
+                    f"{header.byte_count} bytes in {info.compress_size} of its file; at most {most} are read"
                 )
             data = bytearray()
             while block := stream.read(_BLOCK):  # to the very end, where the checksum is compared
@@ -147,9 +150,10 @@ class NpzFile:
         with self._open(name) as stream:
             if not read_array_header(stream, objects=True).dtype.hasobject:
                 raise ValueError("an array of no objects")
-            data = stream.read(self._most + 1)
-        if len(data) > self._most:
-            raise ValueError(f"more than {self._most} bytes of Python objects")
+            most = _most(self._members[name])
+            data = stream.read(most + 1)
+        if len(data) > most:
+            raise ValueError(f"more than {most} bytes of Python objects")
         return data
 
     @contextmanager

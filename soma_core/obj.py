@@ -10,7 +10,7 @@ import numpy as np
 
 from soma_core.cache import atomic_text
 from soma_core.errors import AssetError
-from soma_core.files import refuse_unreadable
+from soma_core.files import refuse_far, refuse_unreadable
 
 __all__ = ["obj_lines", "read_obj", "write_obj"]
 
@@ -53,6 +53,7 @@ def read_obj(path: Path | str) -> tuple[np.ndarray, np.ndarray]:
     if not np.isfinite(vertices).all():
         bad = int(np.flatnonzero(~np.isfinite(vertices).all(1))[0])
         raise AssetError(path, cause=f"vertex {bad} is not finite", fix="Export the mesh again.")
+    refuse_far(path, vertices)
     return vertices, triangles
 
 

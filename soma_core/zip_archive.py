@@ -42,10 +42,19 @@ def open_archive(
             raise AssetError(path, cause=f"not {kind} (it starts with {head[:8]!r})", fix=fix)
         _refuse_long_directory(Path(path))
         archive = zipfile.ZipFile(path)
+        _refuse_doubles(archive)
     except ARCHIVE_DAMAGE as error:
         raise AssetError(path, cause=f"damaged {kind.partition(' ')[2]} ({error})", fix=fix) from error
     with archive:
         yield archive
+
+
+def _refuse_doubles(archive: zipfile.ZipFile) -> None:
+    """Refuse two members of one name: which of them counts differs by who reads."""
+    names = [name.removesuffix(".npy") for name in archive.namelist()]
+    if len({*names}) < len(names):
+        twice = next(name for place, name in enumerate(names) if name in names[:place])
+        raise ValueError(f"it holds {twice!r:.60} twice")
 
 
 def _refuse_long_directory(path: Path) -> None:

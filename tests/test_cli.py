@@ -63,6 +63,11 @@ def test_unknown_command_suggests_the_closest(capsys) -> None:
     assert 'Did you mean "animate"?' in streams.err
 
 
+def test_names_give_a_terminal_no_orders(capsys) -> None:
+    assert main(["backends", "show", "a\x1b[31m"]) == 3
+    assert "\x1b" not in capsys.readouterr().err
+
+
 def test_every_task_in_the_table_has_a_module_and_a_config() -> None:
     for row in TASKS.values():
         assert importlib.util.find_spec(f"soma_core.tasks.{row.module}") is not None

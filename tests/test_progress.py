@@ -3,7 +3,7 @@
 import io
 import logging
 
-from soma_core.progress import progress
+from soma_core.progress import PrintableFormatter, printable, progress
 
 
 def test_plain_lines_count_every_step(caplog, monkeypatch):
@@ -37,3 +37,12 @@ def test_short_work_says_nothing(caplog, monkeypatch):
     with caplog.at_level(logging.INFO):
         assert list(progress(range(3), label="work", total=3, after=60.0)) == [0, 1, 2]
     assert not caplog.records
+
+
+def test_orders_to_a_terminal_are_written_out():
+    owned = "a\x1b]0;owned\x07\x9b31m\u202ename\r.bvh"
+    shown = r"a\x1b]0;owned\x07\x9b31m\u202ename\r.bvh"
+    assert printable(owned) == shown
+    assert printable("Ägypten\t数据\n") == "Ägypten\t数据\n"
+    record = logging.LogRecord("soma_core", logging.WARNING, "", 0, "%s: odd", (owned,), None)
+    assert PrintableFormatter("%(message)s").format(record) == f"{shown}: odd"

@@ -20,6 +20,7 @@ from soma_core.cache import atomic_text
 from soma_core.errors import SomaError
 from soma_core.paths import assets_dir
 from soma_core.plugin.registry import default_registry
+from soma_core.progress import PrintableFormatter
 from soma_core.rig.manifest import read_manifest
 
 __all__ = ["describe_environment", "run_log", "write_provenance"]
@@ -81,9 +82,9 @@ def run_log(folder: Path) -> Iterator[None]:
     root = logging.getLogger()
     level = root.level
     file = logging.FileHandler(folder / "log.txt", encoding="utf-8")
-    file.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(name)s: %(message)s"))
+    file.setFormatter(PrintableFormatter("%(asctime)s %(levelname)s %(name)s: %(message)s"))
     terminal = logging.StreamHandler(sys.stderr)
-    terminal.setFormatter(logging.Formatter("%(message)s"))
+    terminal.setFormatter(PrintableFormatter("%(message)s"))
     handlers: list[logging.Handler] = [file, terminal]
     root.setLevel(min(level, logging.INFO))
     for handler in handlers:

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from soma_core.errors import AssetError
-from soma_core.files import refuse_unreadable
+from soma_core.files import refuse_far, refuse_unreadable
 from soma_core.obj import obj_lines
 
 __all__ = ["read_mesh_vertices", "read_ply_triangles"]
@@ -40,6 +40,7 @@ def read_mesh_vertices(path: Path) -> np.ndarray:
         raise AssetError(path, cause=f"no readable mesh ({error})", fix="Export the mesh again.") from error
     if not len(vertices):
         raise AssetError(path, cause="holds no vertices", fix="Export the mesh again.")
+    refuse_far(path, vertices)
     return vertices
 
 

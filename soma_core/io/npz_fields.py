@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from soma_core.errors import InputError
+from soma_core.files import FARTHEST
 from soma_core.npz import NpzFile, open_npz_file
 
 __all__ = ["NpzFields", "check_rotations", "open_npz", "say_overridden"]
@@ -63,7 +64,7 @@ class NpzFields:
             ) from error
 
     def numbers(self, key: str, shape: tuple[int | str, ...]) -> np.ndarray:
-        """Finite numbers under `key` as float64; `shape` gives fixed sizes as ints, free ones as names."""
+        """Numbers of a body under `key` as float64; `shape` gives fixed sizes as ints, free ones as names."""
         array = self.raw(key)
         fits = array.ndim == len(shape) and all(
             isinstance(want, str) or have == want for have, want in zip(array.shape, shape, strict=False)
@@ -77,12 +78,12 @@ class NpzFields:
                 fix="Write the array in that layout.",
             )
         values = array.astype(np.float64)
-        bad = np.argwhere(~np.isfinite(values))
+        bad = np.argwhere(~(np.abs(values) <= FARTHEST))
         if len(bad):
             raise self.refuse(
                 key,
                 got=f"{values[tuple(bad[0])]} at index {tuple(map(int, bad[0]))}",
-                expected="finite numbers",
+                expected=f"finite numbers up to {FARTHEST:g}",
                 fix="Remove or interpolate the damaged frames.",
             )
         return values

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from soma_core.errors import InputError, SomaError
+from soma_core.files import refuse_far
 from soma_core.io.data_files import open_data
 from soma_core.io.humanml3d import joints_of_humanml3d
 from soma_core.io.json_frames import frame_files
@@ -97,7 +98,7 @@ def read_points(
     elif path.is_dir() or path.suffix.lower() == ".json":
         try:
             found = (_of_folder if path.is_dir() else _of_json)(path, person, size)
-        except (AttributeError, IndexError, KeyError, TypeError, ValueError) as error:
+        except (AttributeError, IndexError, KeyError, OverflowError, TypeError, ValueError) as error:
             if isinstance(error, SomaError):
                 raise
             raise _no_points(path, "lists and names", "JSON", size) from error
@@ -367,6 +368,7 @@ def _stacked(path: Path, frames: Sequence[np.ndarray | None], layout: str, size:
 def _ordered(path: Path, found: PointFrames, names: Sequence[str]) -> PointFrames:
     """Points in the order of `names`; those of no confidence are not known."""
     positions, confidence = found.positions, found.confidence
+    refuse_far(path, positions, "point")
     if confidence is not None:
         gone = ~(confidence > 0)
         positions = np.where(gone[..., None], np.nan, positions)

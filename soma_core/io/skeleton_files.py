@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Literal
 
 from soma_core.errors import InputError
-from soma_core.files import refuse_unreadable
+from soma_core.files import refuse_far, refuse_unreadable
 from soma_core.io.bvh_file import read_bvh
 from soma_core.io.fbx import read_fbx
 from soma_core.io.skeleton_motion import SkeletonMotion
@@ -54,5 +55,8 @@ def read_skeleton(
         if reader is not read_bvh:
             raise InputError("angles", got=f"rad for {path.name}", expected="none: the file tells its angles",
                              fix="Leave angles out.")  # fmt: skip
-        return read_bvh(path, fps=fps, root=root, angles=angles)
-    return reader(path, fps=fps, root=root)
+        reader = partial(read_bvh, angles=angles)
+    motion = reader(path, fps=fps, root=root)
+    refuse_far(path, motion.rest, "joint")
+    refuse_far(path, motion.root, "the root of frame")
+    return motion

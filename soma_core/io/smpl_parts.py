@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from soma_core.errors import InputError
+from soma_core.files import FARTHEST
 from soma_core.io.data_files import DataFile
 from soma_core.io.smpl_bodies import FoundBody
 from soma_core.io.smpl_names import PARTS
@@ -58,14 +59,14 @@ class BodyParts:
         return array
 
     def numbers(self, part: str) -> np.ndarray:
-        """Numbers of a part as float64; those that are missing stay NaN."""
+        """Numbers of a part as float64; those that are missing stay NaN, and those that cannot be are."""
         array = self.raw(part)
         if array.dtype.kind not in "fiub":
             raise self.refuse(
                 part, got=f"shape {array.shape}, dtype {array.dtype}", expected="numbers",
                 fix="Save it as numbers.",
             )  # fmt: skip
-        return np.where(np.isfinite(values := array.astype(np.float64)), values, np.nan)
+        return np.where(np.abs(values := array.astype(np.float64)) <= FARTHEST, values, np.nan)
 
     def rows(self, part: str, frames: int, width: int) -> np.ndarray:
         """Numbers (frames, width) of a part, whatever axes of one stand between; one row counts for all."""

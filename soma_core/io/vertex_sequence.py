@@ -9,6 +9,7 @@ from typing import Literal
 import numpy as np
 
 from soma_core.errors import AssetError, InputError
+from soma_core.files import refuse_far
 
 __all__ = ["UpAxis", "VertexSequence", "even_rate"]
 
@@ -56,7 +57,7 @@ class VertexSequence(ABC):
 
         Raises:
             InputError: the range is empty or leaves the sequence.
-            AssetError: the file is damaged there.
+            AssetError: the file is damaged there, or has a vertex where no body is.
         """
         if not 0 <= start < stop <= self.frame_count:
             raise InputError(
@@ -65,7 +66,9 @@ class VertexSequence(ABC):
                 expected=f"a range inside the {self.frame_count} frames",
                 fix="Give start and stop inside the sequence.",
             )
-        return self._read(start, stop)
+        vertices = self._read(start, stop)
+        refuse_far(self.path, vertices)
+        return vertices
 
     @abstractmethod
     def _read(self, start: int, stop: int) -> np.ndarray:

@@ -11,6 +11,7 @@ import numpy as np
 import scipy.sparse
 
 from soma_core.errors import AssetError, InputError
+from soma_core.files import FARTHEST
 from soma_core.json_file import parse_json
 from soma_core.npz import NpzFile, open_npz_file
 from soma_core.paths import assets_dir
@@ -228,7 +229,7 @@ def read_stored_rig(path: Path) -> StoredRig | None:
         and points.ndim == 2
         and parents.shape == (count,)
         and all(world.shape == shapes[1] and np.isfinite(world).all() for world in worlds)
-        and np.isfinite(points).all()
+        and bool((np.abs(points) <= FARTHEST).all())
         and bool(((parents >= 0) & (parents < count)).all())
     )
     if not fits:

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from soma_core.errors import AssetError
+from soma_core.files import FARTHEST
 from soma_core.rig.expansion import public_rig, with_helpers
 from soma_core.rig.influences import read_weights
 from soma_core.rig.manifest import RESTORE
@@ -173,8 +174,10 @@ def _bind_points(path: Path, skin: Usd.Prim) -> np.ndarray:
 
     values = UsdGeom.Mesh(skin).GetPointsAttr().Get()
     points = np.array(values if values is not None else [], np.float64).reshape(-1, 3)
-    if not len(points) or not np.isfinite(points).all():
-        cause = f"{skin.GetPath()} holds {'NaN or infinity' if len(points) else 'no points'}"
+    if not len(points) or not (np.abs(points) <= FARTHEST).all():
+        cause = (
+            f"{skin.GetPath()} holds {'NaN or infinity, or places far away' if len(points) else 'no points'}"
+        )
         raise AssetError(path, cause=cause, fix="Export the mesh again")
     authored = UsdSkel.BindingAPI(skin).GetGeomBindTransformAttr()
     # geomBindTransform is the mesh's world transform at bind time; UsdSkel ignores the mesh's own

@@ -26,7 +26,7 @@ from soma_core.plugin.registry import default_registry
 from soma_core.viewer.scene import Scene, Switches
 from soma_core.viewer.session import Figure, Session
 from soma_core.viewer.sliders import Controls, ParameterSliders
-from soma_core.viewer.sources import settings_of
+from soma_core.viewer.sources import escaped, settings_of
 
 __all__ = ["Page"]
 
@@ -325,7 +325,7 @@ class Page:
         motion, count = self.session.motion, self.session.frame_count
         self.handles["play"].disabled = self.handles["frame"].disabled = count < 2
         self.handles["frame"].max = max(count - 1, 1)
-        told = f"**{motion.source or 'a motion'}**"
+        told = f"**{escaped(motion.source or 'a motion')}**"
         if count > 1:
             told += f": {count} frames, {motion.fps:g} fps, {count / motion.fps:.1f} s"
         self.handles["about"].content = told

@@ -1,8 +1,9 @@
-"""What files and settings that are typed on the page mean."""
+"""What files and settings that are typed on the page mean, and how their names are shown there."""
 
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 from typing import Any
 
@@ -19,10 +20,15 @@ from soma_core.motion.posed_input import PosedInput
 from soma_core.plugin.spec import BackendSpec
 from soma_core.topology.frames import METRES, native_to_canonical
 
-__all__ = ["holds_motion", "recorded", "settings_of"]
+__all__ = ["escaped", "holds_motion", "recorded", "settings_of"]
 
 _MESHES = (".npy", ".glb", ".usd", ".usda", ".usdc", ".usdz")
 """Files whose vertices are compared, though some have a skeleton too."""
+
+
+def escaped(name: str) -> str:
+    """A name as text of Markdown: HTML, pictures and links in names of strangers are shown, not made."""
+    return re.sub(r"([!-/:-@\[-`{-~])", r"\\\1", " ".join(name.split()))
 
 
 def holds_motion(path: Path) -> bool:

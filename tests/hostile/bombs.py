@@ -6,6 +6,7 @@ import io
 import json
 import pickle
 import struct
+import warnings
 import zipfile
 from collections.abc import Callable, Iterator
 
@@ -244,12 +245,88 @@ def _layers() -> Iterator[tuple[str, bytes]]:
     )
 
 
+def _far() -> Iterator[tuple[str, bytes]]:
+    """Places that a file can hold and no body has: their squares are infinite."""
+    for name, number in (("far away", "1e300"), ("very far away", "-1e160")):
+        triangle = f"v 0 0 0\nv {number} 0 0\nv 0 {number} 0\nf 1 2 3\n"
+        yield f"obj of {name}", triangle.encode()
+        head = "ply\nformat ascii 1.0\nelement vertex 3\n"
+        head += "".join(f"property double {axis}\n" for axis in "xyz")
+        faces = "element face 1\nproperty list uchar int vertex_indices\nend_header\n"
+        yield f"ply of {name}", f"{head}{faces}0 0 0\n{number} 0 0\n0 {number} 0\n3 0 1 2\n".encode()
+        stream = io.BytesIO()
+        np.savez(stream, vertices=np.full((1, 5, 3), float(number)), poses=np.full((3, 77, 3), float(number)))
+        yield f"npz of {name}", stream.getvalue()
+        moved = "CHANNELS 3 Xposition Yposition Zposition\nEnd Site\n{\nOFFSET 0 1 0\n}\n}\nMOTION\n"
+        for place, rest, root in (("a joint", number, "0"), ("a root", "1", number)):
+            joint = f"JOINT a\n{{\nOFFSET 0 {rest} 0\nCHANNELS 0\n}}\n"
+            text = f"HIERARCHY\nROOT Hips\n{{\nOFFSET 0 1 0\n{moved.replace('End', joint + 'End', 1)}"
+            yield f"bvh of {place} {name}", f"{text}Frames: 1\nFrame Time: 0.04\n0 {root} 0\n".encode()
+        row = ",".join([number] * 6)
+        yield f"csv of {name}", f"Hips_x,Hips_y,Hips_z,Head_x,Head_y,Head_z\n{row}\n".encode()
+        frames = [{"keypoints": [[0, float(number), 0, 1]] * 2}]
+        yield f"JSON of points {name}", json.dumps({"fps": 30, "frames": frames}).encode()
+    point = np.array([[3e38, 0, 0], [0, 1, 0]], "<f4").tobytes()
+    accessor = {"bufferView": 0, "componentType": 5126, "count": 2, "type": "VEC3"}
+    document = {
+        "asset": {}, "nodes": [{"mesh": 0}], "meshes": [{"primitives": [{"attributes": {"POSITION": 0}}]}],
+        "accessors": [accessor], "bufferViews": [{"buffer": 0, "byteLength": 24}],
+        "buffers": [{"byteLength": 24}],
+    }  # fmt: skip
+    yield "glb of vertices far away", glb_bytes(document, point)
+    nodes = [{"name": "Hips", "children": [1]}, {"name": "LeftLeg", "translation": [0, -1e300, 0]}]
+    yield "glb of a joint far away", glb_bytes({"asset": {}, "nodes": nodes, "skins": [{"joints": [0, 1]}]})
+    for digits in (4_000, 1_000_000):
+        frames = f'{{"fps": 30, "frames": [{{"keypoints": [[0, {"9" * digits}, 0, 1], [0, 1, 0, 1]]}}]}}'
+        yield f"JSON of {digits} digits", frames.encode()
+    names = ",".join(f"a{number}_x,a{number}_y,a{number}_z" for number in range(50_000))
+    yield "csv of very many columns", (names + "\n" + "0," * 149_999 + "0\n").encode()
+
+
+def _archives() -> Iterator[tuple[str, bytes | Callable[[], bytes]]]:
+    """Members of one name, which readers disagree on; members that unfold together to more than each may."""
+    keys = ("poses", "vertices", "mean", "v_template", "pca_matrix", "triangles", "local_rot_mats", "a")
+    for name, second in (("twice", "{}.npy"), ("with and without a suffix", "{}")):
+        stream = io.BytesIO()
+        with zipfile.ZipFile(stream, "w") as archive, warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            for key in keys:
+                for number, place in enumerate(("{}.npy", second)):
+                    array = io.BytesIO()
+                    np.save(array, np.full((3, 77, 3), 0.1 * number))
+                    archive.writestr(place.format(key), array.getvalue())
+        yield f"npz of arrays {name}", stream.getvalue()
+    yield "npz of several bombs", lambda: _several_bombs(400_000)
+    yield "npz of several bombs below the limit", lambda: _several_bombs(200_000)
+
+
+def _several_bombs(frames: int) -> bytes:
+    stream = io.BytesIO()
+    with zipfile.ZipFile(stream, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
+        for key, width in (
+            ("poses", 156),
+            ("trans", 156),
+            ("betas", 156),
+            ("dmpls", 156),
+            ("pose_hand", 156),
+        ):
+            with archive.open(f"{key}.npy", "w", force_zip64=True) as member:
+                np.lib.format.write_array_header_1_0(
+                    member, {"descr": "<f4", "fortran_order": False, "shape": (frames, width)}
+                )
+                for _ in range(frames // 4000):
+                    member.write(bytes(4 * width * 4000))
+    return stream.getvalue()
+
+
 def made() -> Iterator[tuple[str, bytes | Callable[[], bytes]]]:
     """Name -> content, or what makes it."""
     yield from _pickles()
     yield from _tensors()
     yield from _scenes()
     yield from _layers()
+    yield from _far()
+    yield from _archives()
     yield "JSON of many brackets", lambda: b"[" + b"[]," * 2_700_000 + b"[]]"
     texture = "ply\nformat ascii 1.0\ncomment TextureFile /dev/zero\nelement vertex 3\nproperty float x\n"
     texture += "property float y\nproperty float z\nelement face 1\nproperty list uchar int vertex_indices\n"

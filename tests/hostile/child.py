@@ -1,7 +1,7 @@
 """Read hostile files in this process, which has limits and may die; say what became of each.
 
 Run as ``python -m tests.hostile.child FOLDER``, with a request a line on stdin and an answer each on stdout:
-the reader, a tab, and a name of the corpus or ``mutation SEED``.
+the reader, a tab, and a name of the corpus, ``mutation SEED`` or ``number SEED``.
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ import functools
 import json
 import os
 import random
+import re
 import resource
 import sys
 import time
@@ -49,6 +50,17 @@ def mutated(content: bytes, seed: int) -> bytes:
     return bytes(data)
 
 
+_NUMBERS = re.compile(rb"(?<![\w.])-?\d+(?:\.\d*)?(?![\w.])")
+_STRANGE = (b"1e300", b"-1e300", b"5e-324", b"9" * 400, b"-" + b"9" * 4000, b"1e999", b"1e-400")
+
+
+def swollen(content: bytes, seed: int) -> bytes:
+    """A text with another number in place of one of its own."""
+    chance, found = random.Random(seed), [*_NUMBERS.finditer(content)]
+    place, number = chance.choice(found), chance.choice(_STRANGE)
+    return content[: place.start()] + number + content[place.end() :]
+
+
 def _peak() -> int:
     """Most bytes in memory since the last reset."""
     text = Path("/proc/self/status").read_text()
@@ -83,8 +95,8 @@ def _outcome(reader, path: Path) -> dict:
 
 def _make(name: str, path: Path, good: bytes) -> None:
     kind, _, seed = name.partition(" ")
-    if kind == "mutation":
-        path.write_bytes(mutated(good, int(seed)))
+    if kind in ("mutation", "number"):
+        path.write_bytes({"mutation": mutated, "number": swollen}[kind](good, int(seed)))
     elif name in LINKS:
         LINKS[name](path)
     else:

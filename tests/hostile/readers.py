@@ -297,7 +297,8 @@ READERS = [
     ),
     Reader(
         name="faces ply", suffix=".ply", read=lambda path: read_ply_triangles(path, FRAMES + 2),
-        good=_ply_faces, accepts=("ply with a texture elsewhere",),
+        good=_ply_faces,
+        accepts=("ply with a texture elsewhere", "ply of far away", "ply of very far away"),
     ),
     Reader(name="torch file", suffix=".pt", read=read_torch_arrays, good=_torch),
     Reader(name="correctives", suffix=".pt", read=read_weights),

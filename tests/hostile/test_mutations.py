@@ -17,6 +17,18 @@ def test_damaged_files_give_values_or_errors(reader, ask):
         ask(reader.name, f"mutation {seed}")
 
 
+TEXTS = [
+    reader for reader in SMALL
+    if reader.suffix in (".obj", ".json", ".csv", ".bvh", ".usda")
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("reader", TEXTS, ids=lambda reader: reader.name)
+def test_numbers_that_cannot_be_give_values_or_errors(reader, ask):
+    for seed in range(FEW // 5 if reader.apart else FEW):
+        ask(reader.name, f"number {seed}")
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("reader", SMALL, ids=lambda reader: reader.name)
 def test_ten_thousand_damaged_files(reader, ask):

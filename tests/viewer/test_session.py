@@ -13,7 +13,7 @@ from soma_core.motion.options import ConvertOptions
 from soma_core.motion.poses import POSES, named_pose
 from soma_core.options import FrameRange, ViewOptions
 from soma_core.viewer.session import Session
-from soma_core.viewer.sources import settings_of
+from soma_core.viewer.sources import escaped, settings_of
 
 FLOOR_MM = 8.0
 """How far soles that stand give below the floor: soft heels, as ``animate`` places them."""
@@ -189,3 +189,8 @@ def test_settings_that_are_typed():
         settings_of("fsp=60")
     with pytest.raises(InputError, match=r"unit: got 'ell'"):
         settings_of("unit=ell")
+
+
+def test_a_name_on_the_page_is_text():
+    shown = escaped("<img src=x onerror=a()> ![b](//c)\n**走路**_1")
+    assert shown == r"\<img src\=x onerror\=a\(\)\> \!\[b\]\(\/\/c\) \*\*走路\*\*\_1"
