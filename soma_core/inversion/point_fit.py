@@ -52,6 +52,10 @@ _HIPS_PACE = 5.0
 _LASTING = 0.1
 """A joint that is off what is expected stays so for a while [s]: frames within it are no more than one."""
 
+_CARRIED, _TELLING, _MOST, _ALIKE = 2, 1.0, 1.2, 2e-3
+"""How often the trunk of a motion is asked how it is carried, the least length of such a motion [s], how much
+further than expected the trunk rests off the T-pose at most, and a change of its turns that is none [rad]."""
+
 FEWEST = 3
 """A frame with fewer known points is not fitted."""
 
@@ -125,6 +129,7 @@ class PointFit:
         self.origin = (every[..., None] * points).sum(1) / total
         self.points = (points - self.origin[:, None]) * (every > 0)[..., None]
         self.noise = _FIRST_NOISE if noise is None else noise
+        self.mean: Tensor | None = None  # where joints of this motion rest, once it has told
         self.shift, self.bridged = torch.zeros_like(self.points), False
         still = model.mean.expand(len(points), -1, 3, 3)
         self.pose = Pose.begin(still, torch.zeros_like(self.origin))
@@ -174,16 +179,16 @@ class PointFit:
 
     def smooth(self, fps: float) -> None:
         """Fit all frames together, each joint at its usual pace; frames without points are bridged."""
-        pose, model = self.pose, self.model
+        pose = self.pose
         if len(pose.translation) < 3:
             return
         targets = self.points - self.shift + self.origin[:, None]
         found = bridged(replace(pose, translation=pose.translation + self.origin), self.valid)
-        for _ in range(_ROUNDS):
-            rows = rows_of(targets, self.weights, max(self.noise, _FIRST_NOISE))
-            found = PointRows(model, self.rest, rows, smooth=paces(model, fps), share=_share(fps))(found)
+        for turn in range(_ROUNDS):
+            found = self.lowered(targets + self.shift, fps)(found)
             self.pose = replace(found, translation=found.translation - self.origin)
-            if not self._trusted():
+            carried = turn < _CARRIED and len(pose.translation) >= _TELLING * fps and self._carried()
+            if not self._trusted() and not carried:
                 break
         if self.given is None and not torch.equal(self.every, self.sure):
             self.noise = self._sampled()._estimate()
@@ -194,7 +199,27 @@ class PointFit:
         rows = rows_of(points - self.shift, self.weights, max(self.noise, _FIRST_NOISE))
         if fps is None or len(points) < 3:
             return PointRows(self.model, self.rest, rows, smooth=None)
-        return PointRows(self.model, self.rest, rows, smooth=paces(self.model, fps), share=_share(fps))
+        return PointRows(
+            self.model, self.rest, rows, smooth=paces(self.model, fps), share=_share(fps), mean=self.mean
+        )  # fmt: skip
+
+    def _carried(self) -> bool:
+        """Let trunk and collar bones rest off the T-pose as the trunk does here; whether that is new."""
+        model, rest = self.model, matrix_to_axis_angle(self.model.mean)
+        own, seen = rest[model.tells], matrix_to_axis_angle(self.pose.relative[:, model.tells]).mean(0)
+        pull = model.pull[model.tells]
+        stiff = torch.diag_embed(pull.diagonal(dim1=-2, dim2=-1).sum(-1, keepdim=True).expand(-1, 3)) - pull
+        heavy = (stiff @ own[..., None]).squeeze(-1)
+        whole = (own * heavy).sum()
+        if not whole > 0:
+            return False
+        share = ((seen * heavy).sum() / whole).clamp(0, _MOST)
+        moved = (model.tells | model.follows)[:, None, None]
+        mean = torch.where(moved, axis_angle_to_matrix(share * rest), model.mean)
+        if torch.allclose(mean, model.mean if self.mean is None else self.mean, atol=_ALIKE):
+            return False
+        self.mean = mean
+        return True
 
     def _sampled(self) -> PointFit:
         """A fit of some of the frames, evenly spaced, in which points have their way."""

@@ -64,6 +64,7 @@ class PointModel(torch.nn.Module):
         spread: (J,) root mean square angle [degrees] that each joint is expected to be off by.
         pull: (J, 3, 3) how strongly it is, as ``JointPrior.of`` says [1/rad^2].
         hinged: (J,) whether a joint is a hinge.
+        tells, follows: (J,) whose rest is a person's posture, as ``JointRange`` says.
         pace: (J,) usual angular accelerations [rad/s^2].
         prior: (p, 4, 4) moments of the prior, of the solver's pairs [1/rad^2].
     """
@@ -73,6 +74,8 @@ class PointModel(torch.nn.Module):
     mean: Tensor
     pull: Tensor
     hinged: Tensor
+    tells: Tensor
+    follows: Tensor
     pace: Tensor
     spread: Tensor
 
@@ -108,6 +111,7 @@ class PointModel(torch.nn.Module):
             "parents": np.maximum(parents, 0), "weighted": structure.joints,
             "spread": _spread(blocks), "pull": blocks, "pace": prior.paces(rig.joint_names),
             "hold": _HELD * _hold(structure.pairs),
+            **prior.postures(rig.joint_names),
             "hinged": np.isin(np.arange(rig.joint_count), list(prior.hinges(rig.joint_names))),
         }  # fmt: skip
         for key, array in keep.items():

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from typing import Literal
 
 import numpy as np
 
@@ -23,6 +24,9 @@ class JointRange:
         spread: standard deviations [degrees] about `axis`, and about every axis across it.
         pace: usual angular acceleration [rad/s^2] in a motion.
         flexes: whether the joint is a hinge that bends the limb towards positive angles about `axis`.
+        posture: how far a trunk is off the T-pose at rest differs between people and makers of motions.
+            ``tells``: the mean turn in a motion says what share of `rest` it has; ``follows``: the joint then
+            has the same share of its own.
     """
 
     rest: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -30,21 +34,22 @@ class JointRange:
     spread: tuple[float, float] = (20.0, 20.0)
     pace: float = 20.0
     flexes: bool = False
+    posture: Literal["", "tells", "follows"] = ""
 
 
 def _joints() -> dict[str, JointRange]:
     """Pattern -> range of the left side and the middle."""
     x, y, z = (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)
     return {
-        r"Spine1": JointRange(rest=(5, 0, 0), axis=y, spread=(6, 10), pace=8),
-        r"Spine2": JointRange(rest=(-3, 0, 0), axis=y, spread=(6, 8), pace=6),
-        r"Chest": JointRange(rest=(13, 0, 0), axis=y, spread=(8, 9), pace=8),
+        r"Spine1": JointRange(rest=(5, 0, 0), axis=y, spread=(6, 10), pace=8, posture="tells"),
+        r"Spine2": JointRange(rest=(-3, 0, 0), axis=y, spread=(6, 8), pace=6, posture="tells"),
+        r"Chest": JointRange(rest=(13, 0, 0), axis=y, spread=(8, 9), pace=8, posture="tells"),
         r"Neck1": JointRange(axis=y, spread=(10, 10), pace=10),
         r"Neck2": JointRange(rest=(-4, 0, 0), axis=y, spread=(10, 6), pace=8),
         r"Head": JointRange(rest=(-9, 0, 0), axis=y, spread=(15, 10), pace=12),
         r"Jaw": JointRange(axis=x, spread=(6, 3)),
         r"LeftEye": JointRange(rest=(-11, -4, 0), axis=x, spread=(6, 6)),
-        r"LeftShoulder": JointRange(rest=(9.5, -8, -6), axis=x, spread=(8, 10), pace=14),
+        r"LeftShoulder": JointRange(rest=(12, -8, -6), axis=x, spread=(8, 10), pace=14, posture="follows"),
         r"LeftArm": JointRange(rest=(0, -12, -55), axis=x, spread=(20, 40), pace=25),
         r"LeftForeArm": JointRange(rest=(0, -45, 0), axis=(0, -1, 0), spread=(40, 3), flexes=True),
         r"LeftHand": JointRange(rest=(-8, -7, 4), axis=x, spread=(30, 20)),
@@ -111,6 +116,11 @@ class JointPrior:
         found = [self.range_of(name) or JointRange() for name in names]
         return np.array([one.pace for one in found])
 
+    def postures(self, names: Sequence[str]) -> dict[str, np.ndarray]:
+        """Which joints (J,) tell of the posture, and which follow it."""
+        found = [(self.range_of(name) or JointRange()).posture for name in names]
+        return {kind: np.array(found) == kind for kind in ("tells", "follows")}
+
     def hinges(self, names: Sequence[str]) -> dict[int, np.ndarray]:
         """Joint -> unit axis about which it bends the limb."""
         found = {row: self.range_of(name) for row, name in enumerate(names)}
@@ -124,4 +134,4 @@ def _mirrored(left: JointRange) -> JointRange:
     """The range of the other side: turns mirror as axial vectors, x stays, y and z change their sign."""
     flip = np.array([1.0, -1.0, -1.0])
     rest, axis = (tuple((flip * np.array(one)).tolist()) for one in (left.rest, left.axis))
-    return JointRange(rest=rest, axis=axis, spread=left.spread, pace=left.pace, flexes=left.flexes)
+    return replace(left, rest=rest, axis=axis)

@@ -58,10 +58,18 @@ class PointRows:
         smooth: standard deviations (n + 1,) of second differences: of turns [rad] and of the Hips [m];
             None for frames that are apart.
         share: of what is known of joints, but for hinges, that one frame adds to the others.
+        mean: where joints are expected, (J, 3, 3), instead of the model's.
     """
 
     def __init__(
-        self, model: PointModel, rest: PointRest, rows: Rows, *, smooth: Tensor | None, share: float = 1.0
+        self,
+        model: PointModel,
+        rest: PointRest,
+        rows: Rows,
+        *,
+        smooth: Tensor | None,
+        share: float = 1.0,
+        mean: Tensor | None = None,
     ) -> None:
         self.model, self.rest, self.rows, self.smooth = model, rest, rows, smooth
         variables = model.solver.variables
@@ -69,6 +77,7 @@ class PointRows:
         self.below = above[variables][:, model.weighted].to(model.mean)  # (n, T)
         self.variables, self.above = variables, model.parents[variables]
         self.size = 3 * len(variables) + 3
+        self.mean = (model.mean if mean is None else mean)[variables]
         share_of_each = torch.where(model.hinged, 1.0, share)[:, None, None]
         self.pull = (share_of_each * model.pull)[variables]
 
@@ -203,7 +212,7 @@ class PointRows:
 
     def _expected(self, pose: Pose, matrix: Tensor, slope: Tensor) -> Tensor:
         """Energy (F,) of what is known of the joints; its matrix and slope are added."""
-        own, rest = pose.relative[:, self.variables], self.model.mean[self.variables]
+        own, rest = pose.relative[:, self.variables], self.mean
         pull = self.pull
         turned = own @ pull
         crossed = turned @ rest.mT

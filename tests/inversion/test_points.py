@@ -294,3 +294,12 @@ def test_turns_that_points_leave_open_arrive_where_they_are_cheapest():
     found = inversion(points, IDENTITY)
     again = inversion(points, IDENTITY, initial=found)
     assert _angle(found.rotations, again.rotations).amax(1).quantile(0.9) < 1
+
+
+def test_collar_bones_rest_as_the_trunk_of_the_motion_does():
+    clip = load_clip().cut(slice(300, 360))  # whose trunk and collar bones rest near the T-pose
+    turns, path = (torch.as_tensor(one).float() for one in (clip.rotations, clip.translation))
+    points = LAYER.points(LAYER.joints(IDENTITY, turns, path), "smpl22")
+    found = PointInversion(LAYER, "smpl22")(points + 0.01 * randn(*points.shape).float(), IDENTITY, fps=30)
+    collars = [NAMES.index("LeftShoulder"), NAMES.index("RightShoulder")]
+    assert _angle(found.rotations, turns)[:, collars].mean() < 6
