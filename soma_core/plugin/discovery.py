@@ -87,8 +87,12 @@ class Offer:
 
 @dataclass(frozen=True, kw_only=True)
 class Damaged:
-    """An installed distribution whose metadata cannot be read: its name, where it lies, and why not."""
+    """An installed distribution whose metadata cannot be read: its name, where it lies, and why not.
 
+    `distribution` is what messages call it, its folder of metadata where its name cannot be read either.
+    """
+
+    name: str
     distribution: str
     folder: str
     cause: str
@@ -140,7 +144,8 @@ def read_installed() -> tuple[tuple[EntryPointLike, ...], tuple[Damaged, ...]]:
             points.setdefault(normalised(name) or str(number), tuple(found))
         except Exception as error:
             cause = f"{type(error).__name__}: {' '.join(str(error).split())}"
-            damaged.append(Damaged(distribution=name or "a distribution", folder=folder, cause=cause))
+            shown = name or Path(getattr(distribution, "_path", "a distribution")).name
+            damaged.append(Damaged(name=name, distribution=shown, folder=folder, cause=cause))
     return tuple(point for several in points.values() for point in several), tuple(damaged)
 
 

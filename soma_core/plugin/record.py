@@ -21,6 +21,7 @@ from soma_core.plugin.errors import (
     PluginError,
     Stage,
 )
+from soma_core.plugin.installation import reinstall_command
 from soma_core.plugin.spec import BackendSpec
 
 __all__ = [
@@ -100,11 +101,12 @@ def settle(record: Record, allowed: Collection[str]) -> None:
 
 def damaged_entry(damaged: Damaged) -> Entry:
     """The row of a distribution whose metadata cannot be read: it may offer a backend, or nothing of ours."""
+    again = reinstall_command(damaged.name).replace("--upgrade", "--force-reinstall") if damaged.name else ""
     error = BrokenBackendError(
         who=f"{damaged.distribution} in {damaged.folder}",
         stage="lookup",
         cause=f"its metadata is damaged ({damaged.cause})",
-        fix=f"Run: pip install --force-reinstall {damaged.distribution}, or remove it",
+        fix=f"{again or 'Install its package again'}, or remove it",
     )
     return Entry(name="-", distribution=damaged.distribution, version="", state="broken", error=error)
 

@@ -19,6 +19,7 @@ from soma_core.cache import atomic_text
 from soma_core.errors import InputError
 from soma_core.json_file import read_json
 from soma_core.obj import write_obj
+from soma_core.plugin.discovery import CORE_DISTRIBUTION, normalised
 from soma_core.plugin.registry import Registry, default_registry
 from soma_core.rig import load_canonical
 
@@ -103,10 +104,12 @@ def _check_name(name: str, registry: Registry) -> None:
         )  # fmt: skip
     for entry in registry.entries():
         if entry.name == name:
+            ours = normalised(entry.distribution) == CORE_DISTRIBUTION
+            other = "" if ours else f", or run: pip uninstall {entry.distribution}"
             raise InputError(
                 "name", got=f'"{name}", which {entry.distribution} {entry.version} offers',
                 expected="a name that no installed backend has",
-                fix=f"Choose another, or run: pip uninstall {entry.distribution}",
+                fix=f"Choose another{other}.",
             )  # fmt: skip
 
 

@@ -88,6 +88,15 @@ def test_damaged_metadata_hurts_nobody_else(site: Path, file: str, text: str) ->
         assert f"soma-backend-bad in {site}: lookup: its metadata is damaged" in str(row.error)
 
 
+def test_damage_that_hides_a_name_is_told_by_its_folder(site: Path) -> None:
+    folder = Distribution(name="bad").write_metadata(site)
+    (folder / "METADATA").write_bytes(b"\xff")
+    (folder / "entry_points.txt").write_bytes(b"\xff")
+    (row,) = [entry for entry in Registry().entries() if entry.name == "-"]
+    assert str(row.error).startswith(f"{folder.name} in {site}: lookup")
+    assert str(row.error).endswith("Install its package again, or remove it")
+
+
 def test_blocked_backends_add_no_configs(site: Path) -> None:
     Distribution(name="acme").install(site)
     assert Registry(allowed=["soma"]).config_dirs() == ()

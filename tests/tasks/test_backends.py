@@ -187,6 +187,13 @@ def test_the_outcome_of_the_checks_sets_the_exit_code(
     assert json.loads(_run("check", "--all", "--json")[0]) == [report.document()] * 2
 
 
+def test_backends_that_are_blocked_are_not_among_all(monkeypatch: pytest.MonkeyPatch) -> None:
+    registry = Registry([good("acme"), good("bodies")], allowed=["acme"])
+    monkeypatch.setattr(backends, "default_registry", lambda: registry)
+    monkeypatch.setattr(backends, "_checked", lambda name, options: _report("passed"))
+    assert _run("check", "--all") == (_report("passed").brief(), EXIT_OK)
+
+
 def test_a_new_backend_is_written_and_the_next_steps_named(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

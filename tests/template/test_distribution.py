@@ -136,7 +136,7 @@ def test_a_word_that_means_something_else_is_refused(name, tmp_path):
 
 
 def test_a_name_that_is_taken_is_refused(tmp_path):
-    with pytest.raises(InputError, match=r'got "soma", which soma-body-core .* pip uninstall soma-body-core'):
+    with pytest.raises(InputError, match=r'got "soma", which soma-body-core .* Choose another\.$'):
         write_backend("soma", tmp_path)
     with pytest.raises(InputError, match=r'got "good", which soma-backend-good 1.0 offers'):
         write_backend("good", tmp_path, registry=Registry([good()]))
