@@ -203,11 +203,12 @@ def no_motion(path: Path) -> tuple[InputError, bool]:
         names, shown = [str(name) for name in top], shown_names(file)
     if path.suffix.lower() == ".npz":
         shown = ", ".join(names)
-    vertices = any(name == "vertices" or name.endswith("_vertices") for name in names)
+    array = not names and shown.strip().startswith("(")  # a shape without a name
+    vertices = array or any(name == "vertices" or name.endswith("_vertices") for name in names)
     takes = "vertices over time are what soma invert input=FILE takes; points, what points=NAME is for"
     return InputError(
         str(path),
-        got=f"the keys {shown or '(none)'}",
+        got=f"one array {shown.strip()}" if array else f"the keys {shown or '(none)'}",
         expected=_WANTED,
         fix=f"{takes[0].upper()}{takes[1:]}." if vertices else f"Rename the keys in it; {takes}.",
     ), any(_POSE_KEY.search(name) and not _CAMERA_KEY.search(name) for name in names)

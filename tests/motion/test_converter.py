@@ -216,6 +216,14 @@ def test_a_file_without_a_motion_is_refused(tmp_path):
         converted(tmp_path / "shape.npz", tmp_path / "out")
 
 
+def test_an_array_without_keys_is_sent_where_arrays_are_read(tmp_path):
+    np.save(tmp_path / "joints.npy", np.zeros((3, 22, 3)))
+    with pytest.raises(
+        InputError, match=r"got one array \(3, 22, 3\), .*\. Vertices over .*points=NAME is for"
+    ):
+        converted(tmp_path / "joints.npy", tmp_path / "out")
+
+
 def test_without_the_model_the_joints_are_carried_over(
     smplh_models, amass_file, tmp_path, monkeypatch, caplog
 ):
