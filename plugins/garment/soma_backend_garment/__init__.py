@@ -6,6 +6,7 @@ package; ``soma backends convert garment point.pca`` makes what is read.
 
 from __future__ import annotations
 
+import shlex
 import shutil
 from collections.abc import Sequence
 from pathlib import Path
@@ -29,7 +30,6 @@ if TYPE_CHECKING:
 __all__ = ["soma_backend", "soma_convert", "soma_generator"]
 
 _URL = "https://github.com/mbotsch/GarmentMeasurements"
-_CONVERT = "soma backends convert garment point.pca"
 
 
 def _place(*names: str) -> Path:
@@ -40,6 +40,12 @@ def _place(*names: str) -> Path:
 
 def _model() -> Path:
     return _place("point.npz") / "point.npz"
+
+
+def _convert() -> str:
+    """The command that makes what is read, of the published file where a folder of assets holds it."""
+    found = _place("point.pca") / "point.pca"
+    return f"soma backends convert garment {shlex.quote(str(found)) if found.is_file() else found.name}"
 
 
 @hookimpl
@@ -63,7 +69,7 @@ def soma_backend() -> BackendSpec:
         wrap=WrapPair(native=native, wrap=wrap),
         fill_segments=("mouth_bag", "eye_bags", "between_toes"),
         files=(
-            FileNeeded(path=_model(), description="the converted shape space", url=_URL, command=_CONVERT),
+            FileNeeded(path=_model(), description="the converted shape space", url=_URL, command=_convert()),
             FileNeeded(path=native, description="its mean body, mean.obj beside point.pca", url=_URL),
             FileNeeded(
                 path=wrap,

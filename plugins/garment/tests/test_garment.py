@@ -139,6 +139,12 @@ def test_a_user_without_the_files_is_told_what_to_do(data_folder):
     assert "then run: soma backends convert garment point.pca" in error.value.fix
 
 
+def test_a_published_file_in_a_folder_of_assets_is_named(tmp_path, arrays, data_folder, monkeypatch):
+    path = write_pca(tmp_path / "point.pca", *arrays)
+    monkeypatch.setattr(garment, "model_folders", lambda name: [data_folder, tmp_path])
+    assert garment.soma_backend().files[0].command == f"soma backends convert garment {path}"
+
+
 @pytest.mark.slow
 def test_conformance(tmp_path, arrays, data_folder, monkeypatch):
     monkeypatch.setenv("SOMA_CACHE_DIR", str(tmp_path / "cache"))
