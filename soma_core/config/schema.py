@@ -160,7 +160,7 @@ class CorrectivesData:
 class TrainCorrectivesConfig:
     """Configuration of ``soma train-correctives``."""
 
-    teacher: str = "elastic"
+    teacher: str = "bone"
     data: CorrectivesData = field(default_factory=CorrectivesData)
     channels: int = 24
     reach: float = 1.5
