@@ -27,6 +27,7 @@ from soma_core.geometry.rotations import axis_angle_to_matrix
 from soma_core.io import read_motion
 from soma_core.layer import SomaLayer
 from soma_core.paths import assets_dir
+from soma_core.progress import progress
 from soma_core.rig import load_canonical
 from soma_core.rig.mesh import CanonicalMesh
 from soma_core.rig.skeleton import Rig
@@ -266,7 +267,7 @@ def _bodies(
     shown = []
     turned = ((motion - np.eye(3)) ** 2)[:, 1:].sum((1, 2, 3))
     frame = motion[int(turned.argmax())][None]  # the one that bends most
-    for backend, label, params in _BODIES:
+    for backend, label, params in progress(_BODIES, label="body", total=len(_BODIES)):
         layer = SomaLayer(backend, dtype=torch.float64, correctives=None)
         identity = layer.identity(params)
         surface = ElasticSurface(subject.mesh, subject.rig, identity=identity, bones=bones)
@@ -312,7 +313,7 @@ def run(config: DictConfig) -> Report:
     motions = _unseen(rig, config.experiment.count, list(config.experiment.motions))
     rows: list[list[str | float | None]] = []
     figures = []
-    for name, motion in motions.items():
+    for name, motion in progress(motions.items(), label="motion", total=len(motions)):
         before, after, worst = _errors(subject, motion)
         rows.append([name, len(motion), before, after, worst])
         left = 100 * after / before
