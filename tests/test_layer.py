@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 
+from soma_core._inputs import _ROTATION_TOLERANCE, _surely_rotations
 from soma_core.errors import InputError
 from soma_core.geometry.rotations import axis_angle_to_matrix, orthonormality_error
 from soma_core.layer import SomaLayer
@@ -816,6 +817,19 @@ def test_matrices_that_are_no_rotations(tiny, matrix):
 def test_rounded_matrices_are_rotations(tiny):
     turns = axis_angle_to_matrix(poses(2)[0])
     assert tiny()({}, (turns * 1e3).round() / 1e3).vertices.isfinite().all()
+
+
+@pytest.mark.parametrize("scale", [0.0, 1e-6, 1e-4, 1e-3, 3e-3, 1e-2, 0.1, 1.0])
+def test_a_quick_look_at_matrices_lets_no_wrong_one_pass(scale):
+    turns = axis_angle_to_matrix(poses(20)[0])
+    turns = turns + scale * randn(*turns.shape, seed=3).to(turns)
+    passed = [_surely_rotations(one.numpy()) for one in turns.flatten(0, 1)]
+    assert (orthonormality_error(turns).flatten()[passed] < _ROTATION_TOLERANCE).all()
+    assert all(passed) or scale > 1e-4
+    assert not all(passed) or scale < 1e-2
+    for wrong in (torch.nan, torch.inf):
+        turns[3, 4, 1, 2] = wrong
+        assert not _surely_rotations(turns.numpy())
 
 
 @pytest.mark.parametrize(("identities", "count"), [(2, 3), (3, 2)])
