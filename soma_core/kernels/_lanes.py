@@ -7,13 +7,11 @@ lies abreast: their numbers at one place of it are neighbours, which one transac
 """
 
 import functools
-import itertools
 import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from types import SimpleNamespace
 
-import numpy as np
 import torch
 import warp as wp
 from torch import Tensor
@@ -186,8 +184,7 @@ def in_threads(run: Callable[[slice], None], count: int, like: Tensor) -> None:
     if not count:
         return
     threads = 1 if like.is_cuda else min(torch.get_num_threads(), count)
-    bounds = np.linspace(0, count, threads + 1).astype(int)
-    parts = [slice(int(a), int(b)) for a, b in itertools.pairwise(bounds)]
+    parts = [slice(count * k // threads, count * (k + 1) // threads) for k in range(threads)]
     if len(parts) == 1:
         run(parts[0])
         return
