@@ -104,7 +104,7 @@ def test_an_unposed_body_travels_as_its_rest_shape(source, tmp_path):
 
 
 def test_a_run_that_goes_on_keeps_the_body_that_it_found(source, tmp_path, monkeypatch):
-    monkeypatch.setattr(models, "PoseInversion", Stopping)
+    monkeypatch.setattr(models, "GuidedInversion", Stopping)
     monkeypatch.setattr(Stopping, "calls", 1)
     few = {"frames": 2, "iterations": 1}
     with pytest.raises(KeyboardInterrupt):

@@ -161,7 +161,7 @@ def test_chunks_give_what_the_whole_gives(layer, source, tmp_path):
     assert not (tmp_path / "parts/chunks").exists()
 
 
-class Stopping(models.PoseInversion):
+class Stopping(models.GuidedInversion):
     """Stops the run at the third chunk, and counts."""
 
     calls = 0
@@ -177,7 +177,7 @@ def test_a_stopped_run_goes_on_after_the_chunks_that_it_finished(source, tmp_pat
     caplog.set_level("INFO")
     config = configured(input=str(source), chunk=2)
     invert.run(config, tmp_path / "whole")
-    monkeypatch.setattr(models, "PoseInversion", Stopping)
+    monkeypatch.setattr(models, "GuidedInversion", Stopping)
     monkeypatch.setattr(Stopping, "calls", 0)
     with pytest.raises(KeyboardInterrupt):
         invert.run(config, tmp_path / "fit")
@@ -195,7 +195,7 @@ def test_a_stopped_run_goes_on_after_the_chunks_that_it_finished(source, tmp_pat
 
 
 def test_chunks_of_another_configuration_are_refused(source, tmp_path, monkeypatch):
-    monkeypatch.setattr(models, "PoseInversion", Stopping)
+    monkeypatch.setattr(models, "GuidedInversion", Stopping)
     monkeypatch.setattr(Stopping, "calls", 1)
     with pytest.raises(KeyboardInterrupt):
         invert.run(configured(input=str(source), chunk=2), tmp_path / "fit")
