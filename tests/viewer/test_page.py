@@ -232,6 +232,22 @@ def test_the_command_prints_its_address_and_ends_on_ctrl_c(tmp_path):
     assert out.splitlines() == [str(tmp_path / "run")]
 
 
+def photograph(page, picture, profile, *, seconds):
+    """What Chromium shows of the page once it has had so many seconds of its own time."""
+    command = [
+        BROWSER, "--headless=new", "--no-sandbox", "--disable-quic", "--no-first-run", "--disable-sync",
+        "--disable-background-networking", "--disable-component-update", "--use-angle=swiftshader",
+        "--enable-unsafe-swiftshader", f"--virtual-time-budget={1000 * seconds}", "--window-size=1400,680",
+        f"--user-data-dir={profile}", f"--screenshot={picture}",
+        f"http://127.0.0.1:{page.server.get_port()}",
+    ]  # fmt: skip
+    with subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as run:
+        end = time.monotonic() + 240
+        while run.poll() is None and time.monotonic() < end:
+            page.step(0.2)
+        run.kill()
+
+
 @pytest.mark.slow
 @pytest.mark.skipif(BROWSER is None, reason="no Chromium")
 def test_a_browser_shows_the_bodies_and_their_sliders(layers, tmp_path):
@@ -246,26 +262,19 @@ def test_a_browser_shows_the_bodies_and_their_sliders(layers, tmp_path):
     page = Page(server, session, tmp_path)
     settle(page, seconds=0)
     picture = tmp_path / "page.png"
-    command = [
-        BROWSER, "--headless=new", "--no-sandbox", "--disable-quic", "--no-first-run", "--disable-sync",
-        "--disable-background-networking", "--disable-component-update", "--use-angle=swiftshader",
-        "--enable-unsafe-swiftshader", "--virtual-time-budget=25000", "--window-size=1400,680",
-        f"--user-data-dir={tmp_path / 'profile'}", f"--screenshot={picture}",
-        f"http://127.0.0.1:{page.server.get_port()}",
-    ]  # fmt: skip
-    with subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as run:
-        end = time.monotonic() + 240
-        while run.poll() is None and time.monotonic() < end:
-            page.step(0.2)
-        run.kill()
+    for budget in (25, 60, 120):  # a busy machine draws late
+        photograph(page, picture, tmp_path / f"profile{budget}", seconds=budget)
+        pixels = np.asarray(image.open(picture).convert("RGB")).astype(int)
+        red, green, blue = np.moveaxis(pixels, -1, 0)
+        soma = ((green > red + 8) & (green > blue + 8))[:, 320:1040].mean()
+        if soma > 0.01:
+            break
     close(server)
     kept = os.environ.get("SOMA_VIEW_PICTURE")
     if kept:
         seen = image.open(picture).convert("RGB").crop((320, 0, 1400, 680))  # beside what viser says of WebGL
         seen.save(kept, quality=72, method=6)
-    pixels = np.asarray(image.open(picture).convert("RGB")).astype(int)
-    red, green, blue = np.moveaxis(pixels, -1, 0)
     middle, panel = (slice(None), slice(320, 1040)), (slice(None), slice(1060, None))
-    assert ((green > red + 8) & (green > blue + 8))[middle].mean() > 0.01, "no body of soma"
+    assert soma > 0.01, "no body of soma"
     assert ((red > blue + 25) & (green > blue + 12))[middle].mean() > 0.005, "no body of anny"
     assert ((blue > red + 80) & (blue > 180))[panel].sum() > 200, "no sliders"
