@@ -53,7 +53,7 @@ class PoseModel(SkinModel):
         limbs = None if driven is None else LimbStart(whole, driven, structure.joints)
         correctives = None if plain else layer.correctives
         offsets = share = None
-        if correctives is not None:
+        if correctives is not None and len(correctives.owner):  # some move no vertex at all
             offsets = PoseOffsets.of_correctives(
                 correctives, rig, structure.joints, fitted, some=some, **kind
             )

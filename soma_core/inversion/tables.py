@@ -18,6 +18,7 @@ from soma_core.inversion.driven import DrivenJoints
 from soma_core.inversion.elimination import EliminationPlan, elimination_plan
 from soma_core.inversion.offsets import PoseOffsets
 from soma_core.inversion.structure import MomentStructure
+from soma_core.kernels._share_text import MOST_HELPERS, share_room
 
 __all__ = ["SolverTables", "solver_tables"]
 
@@ -197,8 +198,8 @@ class _Modes:
         gram = offsets.gram.double().cpu().numpy().reshape(blocks, width, blocks, width)
         self.gram = gram
         self.sizes = [int((np.einsum("kk->k", gram[p, :, p]) > 0).sum()) for p in range(blocks)]
-        largest = np.abs(gram).max()
-        near = np.abs(gram).max((1, 3)) > _SMALL * largest
+        largest = np.abs(gram).max(initial=0.0)
+        near = np.abs(gram).max((1, 3), initial=0.0) > _SMALL * largest
         moments = [
             one.double().cpu().numpy().reshape(-1, 3, blocks, width)
             for one in (offsets.torque, offsets.force)
@@ -269,7 +270,7 @@ class _Modes:
             "block_count": len(blocks), "feature_columns": offsets.columns, "used_count": len(used),
             "activation_count": activations, "feature_count": len(seen["feature_joint"]),
             "squash": 0 if offsets.first is None else 1 + offsets.squash,
-            "response_size": int(lists["response_start"][-1]),
+            "response_size": max(int(lists["response_start"][-1]), share_room(MOST_HELPERS, activations)),
             "mode_rows": max(s * 3 * (len(r) + 1) for s, r in zip(size, self.rows, strict=True)),
             "mode_tree": size[most] * 6 * len(self.trees[most]),
             "opened": 3 * int((np.diff(lists["taken_start"]) * np.diff(lists["read_start"])).max()),

@@ -7,10 +7,16 @@ products of activations with their shapes stay in registers.
 from soma_core.kernels._solver_text import QUATERNION
 from soma_core.kernels._view_text import TANH
 
-__all__ = ["BLOCK", "SHARE"]
+__all__ = ["BLOCK", "MOST_HELPERS", "MOST_SHARES", "SHARE", "share_room"]
 
-BLOCK = 5
-"""Shares looked at together."""
+BLOCK, MOST_SHARES, MOST_HELPERS = 5, 25, 8
+"""Shares looked at together, and at most; helpers of a limb."""
+
+
+def share_room(helpers: int, activations: int) -> int:
+    """Vectors of working memory that a limb takes."""
+    return 4 * helpers**2 + 20 * helpers + (1 + BLOCK) * activations + MOST_SHARES
+
 
 _SINE = """
     #define SINE(x, s, c) do { V x_ = (x), s_ = zero, c_ = zero; \\

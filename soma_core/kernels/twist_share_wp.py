@@ -11,7 +11,7 @@ from torch import Tensor
 from soma_core.kernels._lanes import lane_count, row_of
 from soma_core.kernels._native import transposing
 from soma_core.kernels._runtime import as_warp, scalar_name
-from soma_core.kernels._share_text import BLOCK
+from soma_core.kernels._share_text import MOST_HELPERS, MOST_SHARES, share_room
 from soma_core.kernels._solver_functions import Task, of_identities, share_function, solver_functions
 
 if TYPE_CHECKING:
@@ -20,8 +20,6 @@ if TYPE_CHECKING:
 __all__ = ["LimbTables", "limb_tables", "shared_twists"]
 
 _ids = wp.array(dtype=wp.int32)
-
-_MOST_HELPERS = 8
 
 
 @of_identities
@@ -86,8 +84,9 @@ def limb_tables(
     lists, numbers = [[len(limbs)]], []
     for limb in limbs:
         helpers, ids, rank = len(limb.helpers), len(limb.ids), limb.shapes.shape[1]
-        needed = 4 * helpers**2 + 20 * helpers + (1 + BLOCK) * ids + count
-        assert helpers <= _MOST_HELPERS, helpers
+        needed = share_room(helpers, ids)
+        assert count <= MOST_SHARES, count
+        assert helpers <= MOST_HELPERS, helpers
         assert needed <= room, (needed, room)
         wide = -(-rank // 4) * 4
         shapes = torch.nn.functional.pad(limb.shapes, (0, wide - rank)).view(ids, -1, 4).transpose(0, 1)

@@ -1,17 +1,20 @@
 """The layer as shipped, twist joints and correctives and all: its own poses come back, joint by joint."""
 
 import itertools
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
 
+from soma_core.correctives.weights import read_weights, write_weights
 from soma_core.errors import InputError
 from soma_core.evaluation.pose_angle_meshes import named_poses, rotation_matrices, strong_poses
 from soma_core.geometry.rotations import axis_angle_to_matrix, matrix_to_axis_angle
 from soma_core.inversion import HINGES, PoseInversion, PosePriors
 from soma_core.inversion.whole import _promising
 from soma_core.layer import SomaLayer
+from soma_core.rig.manifest import CORRECTIVES_NAME, shipped_file
 from tests.bodies import randn
 
 MEAN_MM, MAX_MM, ANGLE_DEG = 0.002, 0.1, 0.2
@@ -301,3 +304,16 @@ def test_targets_may_lie_in_memory_in_any_order(layer, identity, inversion):
     strided = vertices.permute(2, 1, 0).contiguous().permute(2, 1, 0)
     assert not strided.is_contiguous()
     assert torch.equal(inversion(strided, identity).rotations, inversion(vertices, identity).rotations)
+
+
+@pytest.mark.parametrize("kernels", ["torch", "auto"])
+@pytest.mark.parametrize("share", [0.0, 0.01, 0.1])
+def test_correctives_of_any_strength_are_fitted(tmp_path, identity, share, kernels):
+    """Those of a short training hardly move a vertex, some none at all."""
+    weights = read_weights(shipped_file(CORRECTIVES_NAME))
+    write_weights(tmp_path / "faint.pt", replace(weights, second=share * weights.second))
+    layer = SomaLayer("soma", lod="low", correctives=tmp_path / "faint.pt", kernels=kernels)
+    rotations = some_poses(2)
+    result = PoseInversion(layer, kernels=kernels)(posed(layer, identity, rotations), identity)
+    assert 1e3 * float(result.vertex_error.nan_to_num().max()) < 0.1
+    assert torch.isfinite(result.angle_std[:, layer.joint_names.index("Head")]).all()
