@@ -96,11 +96,11 @@ def _components(activity: np.ndarray, second: scipy.sparse.csr_array) -> tuple[n
     and of the matrix alone.
     """
     shared, turn = scipy.linalg.eigh((second.T @ second).toarray())
-    kept = shared > 1e-12 * shared[-1]
+    kept = shared > 1e-12 * shared.max(initial=0.0)
     length, turn = np.sqrt(shared[kept]), turn[:, kept]
     reduced = activity @ (turn * length)
     size, main = scipy.linalg.eigh(reduced.T @ reduced)
-    kept = np.flatnonzero(size > 1e-14 * max(size[-1], 1e-300))[::-1][: len(activity)]
+    kept = np.flatnonzero(size > 1e-14 * size.max(initial=1e-286))[::-1][: len(activity)]
     main = main[:, kept]
     directions = second @ (turn / length @ main)
     largest = np.abs(directions).argmax(axis=0)  # a sign that no library decides

@@ -13,7 +13,7 @@ from typing import Literal
 import numpy as np
 
 from soma_core.errors import AssetError, InputError
-from soma_core.files import refuse_unreadable
+from soma_core.files import FARTHEST, refuse_unreadable
 from soma_core.geometry.euler import matrices_from_euler
 from soma_core.io.skeleton_motion import SkeletonMotion
 from soma_core.io.text_numbers import numbers_of_text
@@ -42,27 +42,13 @@ _MARK = b"\xef\xbb\xbf"
 
 _HEAD = re.compile(rb"(?i:Frames[ \t]*:?[ \t]*(\S+))|(?i:Frame[ \t]*Time[ \t]*:?[ \t]*(\S+))")
 _RATES = (
-    24,
-    25,
-    30,
-    48,
-    50,
-    60,
-    72,
-    90,
-    100,
-    120,
-    144,
-    150,
-    180,
-    200,
-    240,
-    24 / 1.001,
-    30 / 1.001,
-    60 / 1.001,
-)
+    24, 25, 30, 48, 50, 60, 72, 90, 100, 120, 144, 150, 180, 200, 240, 24 / 1.001, 30 / 1.001, 60 / 1.001,
+)  # fmt: skip
 _LEAST, _CLIP = 0.2, 10
 """Largest angle [degrees] of a clip that moves, which has so many frames; radians end at a turn."""
+
+_MOST_TURNED = 1e6
+"""Angle [degrees], thousands of turns, from which on none is meant; at last none is left of its digits."""
 
 _FIX = "Export it again as BVH, with HIERARCHY and MOTION."
 
@@ -126,7 +112,15 @@ def read_bvh(
     turning = np.array([rotates for channels in tree.channels for _, rotates in channels])
     if angles == "rad":
         rows = np.where(turning, np.degrees(rows), rows)
-    elif frames >= _CLIP and _LEAST < _largest(rows)[turning].max(initial=0) <= 2 * np.pi:
+    largest = _largest(rows)
+    for kind, size, most in ((turning, "degrees", _MOST_TURNED), (~turning, "units of length", FARTHEST)):
+        found = largest[kind].max(initial=0)
+        if found > most:
+            raise InputError(
+                f"{path}: MOTION", got=f"{found:.3g} {size}", expected=f"at most {most:g}",
+                fix="Correct or delete the frame.",
+            )  # fmt: skip
+    if angles != "rad" and frames >= _CLIP and _LEAST < largest[turning].max(initial=0) <= 2 * np.pi:
         _log.warning("%s: no angle is above 6.28; if they are radians, pass angles=rad", path.name)
     return _motion(path, tree, rows, rate, root)
 

@@ -236,7 +236,7 @@ def _identity(fields: NpzFields) -> dict[str, object]:
     if not backend:
         return {}
     if "identity_params" in fields:
-        found = {"backend": backend, "params": _parsed(fields, "identity_params"), **_rest(fields)}
+        found = {"backend": backend, "params": _params(fields), **_rest(fields)}
         if "identity_options" in fields:
             given = _parsed(fields, "identity_options")
             # Whether a model file is trusted, and so may run code, is no stranger's to say.
@@ -249,16 +249,33 @@ def _identity(fields: NpzFields) -> dict[str, object]:
     return found
 
 
+def _params(fields: NpzFields) -> dict[str, object]:
+    """Values of the parameters by their names, finite numbers."""
+    params = _parsed(fields, "identity_params")
+    for name, value in params.items():
+        try:
+            numbers = np.asarray(value, np.float64)
+        except (ValueError, TypeError):
+            numbers = np.array(np.nan)
+        if not np.isfinite(numbers).all():
+            raise fields.refuse(
+                "identity_params", got=f"{name} = {value!r:.60}", expected="finite numbers",
+                fix=f"Correct {name}, or leave the identity out and pass backend=NAME.",
+            )  # fmt: skip
+    return params
+
+
 def _rest(fields: NpzFields) -> dict[str, object]:
     """A rest shape (v, 3) [m] that no parameters describe."""
     if "identity_rest" not in fields:
         return {}
     rest = fields.raw("identity_rest")
-    if rest.dtype.kind != "f" or rest.ndim != 2 or rest.shape[1] != 3:
+    fits = rest.dtype.kind == "f" and rest.ndim == 2 and rest.shape[1] == 3
+    if not fits or not np.isfinite(rest).all():
         raise fields.refuse(
             "identity_rest",
-            got=f"{rest.dtype} of shape {rest.shape}",
-            expected="vertices (v, 3) [m] as floating point numbers",
+            got="NaN or infinity" if fits else f"{rest.dtype} of shape {rest.shape}",
+            expected="vertices (v, 3) [m] as finite floating point numbers",
             fix="Write the rest shape on the canonical mesh.",
         )
     return {"rest": rest.astype(np.float32)}

@@ -98,7 +98,7 @@ class BackConverter:
         if earlier is not None:
             return Converted(report=earlier, files=files, earlier=True, vertices=vertices, written=results)
         kept = FittedChunks(chunks, settings, frame_count=motion.frame_count, size=self._options.chunk)
-        body = self._bodies.played(layer, stored, motion)
+        body = self._bodies.played(path, layer, stored, motion)
         if not isinstance(target, VertexTarget) and target.params is None:
             target = replace(target, params=_found_params(kept.folder / "params.json", target, body))
             settings["found"] = target.params

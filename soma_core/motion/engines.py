@@ -238,7 +238,7 @@ def _connected(ray: Any, options: DatasetOptions) -> Iterator[None]:
     """Use the cluster that this process is connected to, that at the address, or one of its own.
 
     Raises:
-        InputError: no cluster answers there.
+        InputError: no cluster answers there, or one of its own does not start.
     """
     if ray.is_initialized():
         yield
@@ -247,10 +247,18 @@ def _connected(ray: Any, options: DatasetOptions) -> Iterator[None]:
     own = {} if options.address else {"num_cpus": cpus, "include_dashboard": False}
     try:
         ray.init(options.address or "local", log_to_driver=False, logging_level=logging.WARNING, **own)
-    except ConnectionError as error:
+    except Exception as error:  # a start that takes too long has no kind of its own
+        if options.address and isinstance(error, ConnectionError):
+            raise InputError(
+                "address", got=options.address, expected="the address of a Ray cluster that runs",
+                fix="ray start --head prints one; ray status says whether it answers.",
+            ) from error  # fmt: skip
+        with contextlib.suppress(Exception):
+            ray.shutdown()
+        told = " ".join(str(error).split())[:200].rstrip(".") or "no text"
         raise InputError(
-            "address", got=options.address, expected="the address of a Ray cluster that runs",
-            fix="ray start --head prints one; ray status says whether it answers.",
+            "engine", got=f"ray, which does not start ({type(error).__name__}: {told})",
+            expected="Ray to start", fix="Try again when the machine is less busy, or pass engine=local.",
         ) from error  # fmt: skip
     try:
         context = ray.data.DataContext.get_current()

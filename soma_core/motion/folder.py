@@ -16,6 +16,7 @@ from typing import Any
 
 from soma_core.cache import UnwritableError, atomic_text
 from soma_core.errors import InputError, SomaError
+from soma_core.files import refuse_unreadable
 from soma_core.io.json_frames import holds_pose_frames
 from soma_core.io.point_files import is_one
 from soma_core.motion.back import BackConverter
@@ -187,11 +188,14 @@ def is_one_motion(folder: Path, options: ConvertOptions) -> bool:
 
 
 def motion_paths(folder: Path) -> Iterator[Path]:
-    """Files that may hold a motion, and folders of JSON frames, hidden ones apart, by their names."""
+    """Files that may hold a motion, and folders of JSON frames, hidden ones apart, by their names.
+
+    Pipes, devices and links to nothing are among them, for the report to say so.
+    """
     suffixes = motion_suffixes()
     for file in sorted(folder.resolve().rglob("*")):
         hidden = any(part.startswith(".") for part in file.relative_to(folder.resolve()).parts)
-        known = file.suffix.lower() in suffixes and file.is_file()
+        known = file.suffix.lower() in suffixes and not file.is_dir()
         if not hidden and (known or holds_pose_frames(file)):
             yield file
 
@@ -228,6 +232,8 @@ def outcome(
         run: name of the run; a file that ends its process a third time in one is refused.
     """
     try:
+        if not file.is_dir():
+            refuse_unreadable(file)
         if layout_of(file) is None:
             reason, poses = no_motion(file)
             if poses:

@@ -208,9 +208,15 @@ class MovingBodies:
             self._layers[key] = open_layer(self._options, name, options)
         return self._layers[key], stored
 
-    def played(self, layer: SomaLayer, stored: Mapping[str, Any], motion: Motion) -> Played:
-        """The motion on that body, where it is to stand."""
+    def played(self, path: Path, layer: SomaLayer, stored: Mapping[str, Any], motion: Motion) -> Played:
+        """The motion of a file on that body, where it is to stand."""
         with torch.no_grad():
-            identity = stored_identity(layer, stored)
+            try:
+                identity = stored_identity(layer, stored)
+            except InputError as error:
+                if self._chosen is not None:
+                    raise
+                name = f"{path}: identity, {error.argument}"
+                raise InputError(name, got=error.got, expected=error.expected, fix=error.fix) from error
             motion = standing_motion(layer, identity, motion, self._placing)
         return Played(layer=layer, identity=identity, motion=replace(motion, identity=stored))

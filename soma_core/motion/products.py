@@ -100,7 +100,7 @@ class BodyProducts:
         same = before.get("settings") == settings
         missing = [product for product, place in places.items() if not (same and place.exists())]
         if missing:
-            played = bodies.played(layer, stored, motion)
+            played = bodies.played(path, layer, stored, motion)
             write_products(played, missing, places.__getitem__, options=options, picture=options.picture)
         report["products"] = {
             "settings": settings,

@@ -14,7 +14,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from soma_core.cache import UnwritableError, atomic_text, atomic_write, file_sha256
-from soma_core.errors import InputError
+from soma_core.errors import AssetError, InputError
+from soma_core.files import refuse_unreadable
 from soma_core.motion.chunks import refuse_other_settings
 from soma_core.motion.clips import Clips, need_pyarrow, refused, row_tables, write_rows
 from soma_core.motion.engines import need_ray, pool_settings, run_job
@@ -155,7 +156,7 @@ def _entries(source: Path, root: Path, out: Path, size: int) -> Iterator[Entry]:
 
 def clip_count(file: Path) -> int | None:
     """Rows of a Parquet file of clips; None for other files: frames of one person are a file as any other."""
-    if file.suffix.lower() != ".parquet":
+    if file.suffix.lower() != ".parquet" or not file.is_file():
         return None
     pa = need_pyarrow()
     try:
@@ -277,10 +278,15 @@ class _Shard:
         for number, (name, start, stop) in enumerate(self.entries):
             file, place = self.job.folder / name, work / str(number)
             try:
+                if not file.is_dir() and not file.is_file():
+                    refuse_unreadable(file)
                 size, changed = _stat(file)
                 inputs[name] = {"bytes": size, "changed": changed, "sha256": _digest(file)}
             except OSError as error:
                 yield from refused(name, error, rows)
+                continue
+            except AssetError as error:  # whose path is that of this machine
+                yield from refused(name, AssetError(name, cause=error.cause, fix=error.fix), rows)
                 continue
             if not stop:
                 yield from self.clips(file, name, place, rows, inputs[name]["sha256"])

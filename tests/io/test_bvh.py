@@ -204,6 +204,8 @@ def test_a_frame_that_is_cut_off_is_left_out(tmp_path, caplog):
         ({"head": "Frames: 2\nFrame Time: 2\n"}, r"Frame Time: got 2.*fps=30"),
         ({"roots": 2}, r"root: got 2 skeletons.*root=Hips"),
         ({"rows": "0 90 0 1 nan 3 4\n"}, r"MOTION: got 'nan'"),
+        ({"rows": "0 90 0 1 1e300 3 4\n"}, r"a\.bvh: MOTION: got 1e\+300 degrees, expected at most 1e\+06"),
+        ({"rows": "0 -1e300 0 1 2 3 4\n"}, r"MOTION: got 1e\+300 units of length, expected at most 1e\+09"),
         ({"rows": "0.5 90 0 1 -1.#IND00 3 4\n"}, r"MOTION: got '-1.#IND00'"),
         ({"root": "CHANNELS 3 Xrotation"}, r"unreadable CHANNELS of 'Hips'"),
         ({"joint": JOINT.replace("{root}", "OFFSET 1 2 x")}, r"unreadable OFFSET of 'Hips'"),

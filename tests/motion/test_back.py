@@ -150,6 +150,13 @@ def test_a_motion_without_a_body_needs_one(tmp_path):
         converted(tmp_path / "m.npz", tmp_path, to="smplh")
 
 
+def test_a_body_that_the_model_has_not_names_the_file(tmp_path):
+    pytest.importorskip("soma_backend_toy")
+    write_motion(motion(identity={"backend": "soma", "params": {"legs": 1.0}}), tmp_path / "m.npz")
+    with pytest.raises(InputError, match=r"m\.npz: identity, params\['legs'\]: got unknown name 'legs'"):
+        converted(tmp_path / "m.npz", tmp_path, to="toy")
+
+
 @pytest.mark.parametrize(
     ("keys", "said"),
     [

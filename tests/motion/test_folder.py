@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import contextlib
 import io
+import json
+import os
 import re
 
 import numpy as np
@@ -81,6 +83,25 @@ def test_errors_and_files_without_a_motion_are_told_apart(tmp_path):
     found = convert_folder(tmp_path, tmp_path / "out")
     assert (list(found.converted), found.skipped, len(found)) == (["good.npz"], ["shape.npz"], 3)
     assert isinstance(found.errors["bad.npz"], AssetError)
+
+
+def test_what_is_no_file_is_a_row_with_a_reason(tmp_path):
+    """Under names of motions; a reader that opened them would wait for ever."""
+    write_motion(motion(), tmp_path / "good.npz")
+    (tmp_path / "folder.npz").mkdir()
+    os.mkfifo(tmp_path / "pipe.npz")
+    (tmp_path / "device.bvh").symlink_to("/dev/zero")
+    (tmp_path / "lost.bvh").symlink_to(tmp_path / "gone")
+    found = convert_folder(tmp_path, tmp_path / "out", options=ConvertOptions(person="all"))
+    assert (list(found.converted), found.skipped) == (["good.npz"], [])
+    said = {name: error.cause for name, error in found.errors.items()}
+    assert said == {
+        "pipe.npz": "is a pipe, not a file", "device.bvh": "is a device, not a file",
+        "lost.bvh": "is a link to nothing",
+    }  # fmt: skip
+    rows = json.loads((tmp_path / "out/report.json").read_text())["files"]
+    assert rows["pipe.npz"]["state"] == "failed"
+    assert "is a pipe, not a file" in rows["pipe.npz"]["reason"]
 
 
 def test_one_file_without_anything_left_on_disk(tmp_path):

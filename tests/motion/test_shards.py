@@ -8,6 +8,7 @@ import os
 import pickle
 import subprocess
 import sys
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -269,6 +270,38 @@ def test_without_ray_it_is_said_how_to_install_it(data, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "ray", None)
     with pytest.raises(InputError, match=r"pip install 'soma-body-core\[ray\]'; or pass engine=local"):
         convert_shards(data, tmp_path / "out", options=options(engine="ray"))
+
+
+@pytest.mark.parametrize(
+    ("address", "error", "told"),
+    [
+        (None, Exception("The current node timed out during startup."),
+         r"engine: got ray, which does not start \(Exception: The current node timed out during startup\), "
+         r"expected Ray to start\. Try again when .*pass engine=local"),
+        ("auto", RuntimeError(""), r"engine: got ray, which does not start \(RuntimeError: no text\)"),
+        ("auto", ConnectionError("none"), "address: got auto, expected the address of a Ray cluster"),
+    ],
+)  # fmt: skip
+def test_ray_that_does_not_start_is_one_sentence(data, tmp_path, monkeypatch, address, error, told):
+    def start(*_given, **_settings):
+        raise error
+
+    ray = SimpleNamespace(is_initialized=lambda: False, init=start, shutdown=lambda: None)
+    monkeypatch.setattr(engines, "need_ray", lambda: ray)
+    chosen = options(engine="ray", workers=1) if address is None else options(engine="ray", address=address)
+    with pytest.raises(InputError, match=told):
+        convert_shards(data, tmp_path / "out", options=chosen)
+
+
+@pytest.mark.usefixtures("here")
+def test_a_pipe_is_a_failed_row(tmp_path):
+    (tmp_path / "in").mkdir()
+    os.mkfifo(tmp_path / "in/a.npz")
+    os.mkfifo(tmp_path / "in/b.parquet")
+    found = convert_shards(tmp_path / "in", tmp_path / "out", options=options())
+    assert found.failed == {
+        name: f"{name}: is a pipe, not a file. Name the file itself." for name in ("a.npz", "b.parquet")
+    }
 
 
 class Ending:

@@ -48,6 +48,14 @@ def _before_build(line: str) -> Edit:
     return _in(_INIT, _BUILD, f"    {line}\n{_BUILD}")
 
 
+def _of_no_form(made: Package) -> None:
+    """Nothing tells the form of a pose, and posed() returns no mesh."""
+    for name in ("def skinning(", "def random_poses("):
+        made.replace(_GENERATOR, name, name.replace("def ", "def other_"))
+    made.replace(_GENERATOR, "pose_size, root_size", "other_size, root_size")
+    _returns("posed", "42")(made)
+
+
 def _returns(method: str, value: str) -> Edit:
     """Let a method return something else before it does anything."""
     head = re.compile(rf"(    def {method}\(self.*\):\n        \"\"\".*\"\"\"\n)")
@@ -410,6 +418,7 @@ MUTANTS = (
         "skinning", "hips far outside the body", _in(_GENERATOR, "joints=joints,", "joints=joints + 400,")
     ),
     Mutant("posed", "got int, expected a tensor", _returns("posed", "42")),
+    Mutant("posed", r"got int, expected \(2, n, 3\)", _of_no_form),
     Mutant("posed", r"posed\(\) with every joint turned", _in(_GENERATOR, "total + shift[:, None]", "total")),
     Mutant("posed", r"posed\(\) with every", _in(_GENERATOR, "_matrix(turns)", "_matrix(turns.deg2rad())")),
     Mutant("posed", "numbers that are not finite", _in(_GENERATOR, "total + shift", "total / 0 + shift")),

@@ -13,7 +13,13 @@ from torch import Tensor
 
 from soma_core.native.skinned import pose_skinned
 from soma_core.plugin.checks import CheckFailedError, CheckNotRunError, check
-from soma_core.plugin.declaration import expressions_problem, skinned_problem, tensor_problem
+from soma_core.plugin.declaration import (
+    expressions_problem,
+    refuse_posed,
+    skinned_problem,
+    tensor_problem,
+)
+from soma_core.plugin.errors import PluginError
 from soma_core.plugin.spec import (
     HasExpressions,
     HasPosed,
@@ -157,11 +163,26 @@ def posed(context: Context) -> None:
             _distance(context, "posed() at zero", found, rest, "Zero is the rest mesh.")
             return
         if not isinstance(generator, HasRandomPoses):
+            _refuse_no_mesh(any_generator, params, len(rest))
             raise CheckNotRunError(
                 "nothing tells the form of a pose: offer skinning(), a pose vector or random_poses()"
             )
         found = any_generator.posed(params, generator.random_poses(len(rest), 0))
     _refuse("posed()", tensor_problem(found, tuple(rest.shape), like=rest), "Return every native vertex.")
+
+
+def _refuse_no_mesh(generator: Any, params: Mapping[str, Tensor], count: int) -> None:
+    """Refuse what is no mesh of `count` bodies, where a pose of a usual form brings any."""
+    still = torch.zeros(count, 3, dtype=torch.float64)
+    pose = {"rotations": still[:, None], "translation": still, "parameters": still}
+    try:
+        found = generator.posed(params, pose)
+    except Exception:  # it takes another form
+        return
+    try:
+        refuse_posed(found, count)
+    except PluginError as error:
+        _refuse("posed()", str(error.cause).removeprefix("posed returned "), "Return every native vertex.")
 
 
 def _compare_skinned(context: Context, generator: Any, params: Mapping[str, Tensor]) -> None:
