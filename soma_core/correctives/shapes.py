@@ -100,7 +100,7 @@ def _components(activity: np.ndarray, second: scipy.sparse.csr_array) -> tuple[n
     length, turn = np.sqrt(shared[kept]), turn[:, kept]
     reduced = activity @ (turn * length)
     size, main = scipy.linalg.eigh(reduced.T @ reduced)
-    kept = np.flatnonzero(size > 1e-14 * size.max(initial=1e-286))[::-1][: len(activity)]
+    kept = np.flatnonzero(size > 1e-14 * size.max(initial=1e-300))[::-1][: len(activity)]
     main = main[:, kept]
     directions = second @ (turn / length @ main)
     largest = np.abs(directions).argmax(axis=0)  # a sign that no library decides

@@ -33,9 +33,8 @@ __all__ = ["PoseOffsets"]
 _FILLED = 0.1
 """Share of entries from which shapes are no longer treated as sparse."""
 
-_LEAST_MODE, _LEAST_SHAPE = 1e-4, 1e-4
-"""Root mean square motion of all vertices [m] below which a mode of one joint's shapes is left out; and one
-of those that tell how a limb shares its twist."""
+_LEAST_MODE = 1e-4
+"""Root mean square motion of all vertices [m] below which a mode of one joint's shapes is left out."""
 
 
 class PoseOffsets(torch.nn.Module):
@@ -156,7 +155,7 @@ class PoseOffsets(torch.nn.Module):
         shapes = self.shapes.scipy()[:, ids.cpu().numpy()]
         counted = scipy.sparse.diags_array(np.repeat(fitted.astype(np.float64), 3)) @ shapes
         values, vectors = np.linalg.eigh((shapes.T @ counted).toarray())
-        kept = values > fitted.sum() * _LEAST_SHAPE**2
+        kept = values > fitted.sum() * _LEAST_MODE**2
         coordinates = vectors[:, kept] * np.sqrt(values[kept])
         return {
             "ids": ids, "by_own": reads[ids, 0], "by_end": reads[ids, 1],

@@ -328,7 +328,8 @@ class SkinModel(torch.nn.Module):
         diagonal = dense.diagonal(dim1=-2, dim2=-1)
         diagonal += damping * diagonal + _RIDGE * diagonal.mean(1, keepdim=True)
         factor, failed = torch.linalg.cholesky_ex(dense)
-        factor = torch.where(failed[:, None, None] > 0, torch.eye(dense.shape[1]).to(dense), factor)
+        still = torch.eye(dense.shape[1], dtype=dense.dtype, device=dense.device)
+        factor = torch.where(failed[:, None, None] > 0, still, factor)  # a zero pivot would raise
         own = torch.cholesky_inverse(factor).diagonal(dim1=-2, dim2=-1)
         return own.unflatten(1, (-1, 3)).sum(-1)[:, :-1].masked_fill((failed > 0)[:, None], torch.nan)
 

@@ -198,8 +198,8 @@ class _Modes:
         gram = offsets.gram.double().cpu().numpy().reshape(blocks, width, blocks, width)
         self.gram = gram
         self.sizes = [int((np.einsum("kk->k", gram[p, :, p]) > 0).sum()) for p in range(blocks)]
-        largest = np.abs(gram).max(initial=0.0)
-        near = np.abs(gram).max((1, 3), initial=0.0) > _SMALL * largest
+        largest = np.abs(gram).max()
+        near = np.abs(gram).max((1, 3)) > _SMALL * largest
         moments = [
             one.double().cpu().numpy().reshape(-1, 3, blocks, width)
             for one in (offsets.torque, offsets.force)

@@ -76,7 +76,7 @@ class NativeRig(SkinModel):
         kernels: ``torch`` (the reference), ``warp`` or ``auto``.
 
     Attributes:
-        joint_names, joint_parents: of the model's joints; -1 is the parent of the first.
+        joint_names: of the model's joints.
         blended: whether poses add to the rest mesh before it is skinned.
         linear: whether that is linear in the entries of the rotations.
     """
@@ -98,15 +98,12 @@ class NativeRig(SkinModel):
         if blend is not None:
             shapes = scale * blend_shapes(blend, len(model.joints[0]), **kind)
             linear = is_linear(blend, shapes / scale)
-            blend = None if linear and not bool(shapes.any()) else blend
-        if blend is not None:
             offsets = _offsets(shapes, rig, structure, **kind)
         super().__init__(
             rig, structure, Animation(rig, kernels=kernels, dtype=dtype, device=device), offsets=offsets,
             warp=kernels == "warp" or (kernels == "auto" and device.type == "cpu"), **kind,
         )  # fmt: skip
-        self.joint_names, self.joint_parents = rig.user_joint_names, tuple(model.parents)
-        self.linear, self._scale, self._blend = linear, scale, blend
+        self.joint_names, self.linear, self._scale, self._blend = rig.user_joint_names, linear, scale, blend
         self.blended = blend is not None
 
     def bodies(self, rest: Tensor, joints: Tensor) -> Identity:

@@ -1,12 +1,16 @@
 """Shapes of a motion add up to its correctives."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
 
 from soma_core.correctives.shapes import corrective_shapes
+from soma_core.correctives.weights import read_weights, write_weights
 from soma_core.geometry.rotations import axis_angle_to_matrix
 from soma_core.layer import SomaLayer
+from soma_core.rig.manifest import CORRECTIVES_NAME, shipped_file
 from tests.bodies import randn
 
 TOLERANCE = 1e-4
@@ -69,3 +73,10 @@ def test_the_bind_pose_has_none(layer, identity):
     turned = layer.correctives(still, identity.bind_world).abs().max()
     shapes = corrective_shapes(layer.correctives, still, identity.bind_world)
     assert (len(shapes) == 0) == bool(turned < TOLERANCE)
+
+
+def test_correctives_that_move_nothing_have_none(identity, tmp_path):
+    weights = read_weights(shipped_file(CORRECTIVES_NAME))
+    write_weights(tmp_path / "still.pt", replace(weights, second=0.0 * weights.second))
+    still = SomaLayer("soma", lod="low", correctives=tmp_path / "still.pt").correctives
+    assert len(corrective_shapes(still, swung(3), identity.bind_world)) == 0

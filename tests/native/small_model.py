@@ -7,14 +7,15 @@ from typing import Literal
 import torch
 from torch import Tensor
 
+from soma_core.layer import Kernels
 from soma_core.native.model import NativeBody, NativeRig
 from soma_core.native.poses import PoseFit
 from soma_core.plugin.spec import SkinnedModel
 
 __all__ = ["PARENTS", "make_fit", "make_model", "make_rig", "random_pose"]
 
-Blend = Literal["none", "linear", "curved"]
-"""What a pose adds to the rest mesh: nothing, or functions of the rotations' entries."""
+Blend = Literal["none", "zero", "linear", "curved"]
+"""What a pose adds to the rest mesh: nothing, zeros, or functions of the rotations' entries."""
 
 PARENTS = (-1, 0, 1, 2, 0, 4)
 _AROUND = 40
@@ -39,6 +40,7 @@ def make_model(*, blend: Blend = "linear", betas: Tensor | None = None) -> Skinn
     weights[torch.arange(len(rest)), owner] -= share
     weights[torch.arange(len(rest)), above] += share
     shapes = 0.01 * torch.randn(9 * count, len(rest), 3, generator=random, **_KIND)
+    shapes *= blend != "zero"
     shapes[:9] = 0  # turning the whole body changes no shape
 
     def offsets(rotations: Tensor) -> Tensor:
@@ -57,10 +59,10 @@ def make_model(*, blend: Blend = "linear", betas: Tensor | None = None) -> Skinn
     )  # fmt: skip
 
 
-def make_rig(model: SkinnedModel, *, covered: Tensor | None = None) -> NativeRig:
+def make_rig(model: SkinnedModel, *, covered: Tensor | None = None, kernels: Kernels = "torch") -> NativeRig:
     """Its rig in metres."""
     chosen = torch.ones(model.rest.shape[1], dtype=torch.bool) if covered is None else covered
-    return NativeRig(model, 1.0, chosen.numpy(), kernels="torch", **_KIND)
+    return NativeRig(model, 1.0, chosen.numpy(), kernels=kernels, **_KIND)
 
 
 def make_fit(rig: NativeRig, model: SkinnedModel, *, iterations: int = 30) -> PoseFit:

@@ -41,6 +41,15 @@ def test_poses_of_the_model_itself_are_recovered(small):
     torch.testing.assert_close(pose.translation, pelvis, atol=EXACT, rtol=0)
 
 
+@pytest.mark.parametrize("kernels", ["torch", "auto"])
+def test_blend_shapes_may_move_nothing(kernels):
+    model = make_model(blend="zero")
+    rig = make_rig(model, kernels=kernels)
+    fit = make_fit(rig, model)
+    target, rotations, _ = targets(rig, fit)
+    torch.testing.assert_close(fit(target).relative[:, 1:], rotations, atol=EXACT, rtol=0)
+
+
 def test_no_slope_is_left_where_the_target_is_out_of_reach(small):
     _, rig, fit = small
     target, _, _ = targets(rig, fit)
