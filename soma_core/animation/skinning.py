@@ -13,7 +13,7 @@ from torch import Tensor
 
 from soma_core.geometry.constants import constant
 from soma_core.geometry.sparse import Csr, SparseRows, gather_rows, sparse_product
-from soma_core.geometry.torch_func import transformed
+from soma_core.geometry.torch_func import operator, transformed
 
 if TYPE_CHECKING:
     from soma_core.kernels.body_skin_wp import Blend
@@ -59,7 +59,7 @@ def _blend_into(out: Tensor, points: Tensor, planes: Tensor, weights: Csr, *, ro
 
 
 # Operators of their own, so that torch.compile takes them whole: chunks, strided outputs and all.
-@torch.library.custom_op("soma_core::blend", mutates_args=())
+@operator("soma_core::blend")
 def _blend(points: Tensor, planes: Tensor, rows: bool, matrix: Sequence[Tensor]) -> Tensor:
     """Blend, apply and lay out, one chunk of poses at a time; `matrix` is weights, then their transpose."""
     count, batch = len(matrix[0]) - 1, planes.shape[3]
@@ -74,7 +74,7 @@ def _(_points: Tensor, planes: Tensor, rows: bool, matrix: Sequence[Tensor]) -> 
     return planes.new_empty((batch, count, 3) if rows else (3, count, batch))
 
 
-@torch.library.custom_op("soma_core::blend_backward", mutates_args=())
+@operator("soma_core::blend_backward")
 def _blend_backward(
     grad: Tensor, points: Tensor, planes: Tensor, rows: bool, matrix: Sequence[Tensor]
 ) -> tuple[Tensor, Tensor]:

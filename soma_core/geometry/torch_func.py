@@ -1,12 +1,16 @@
-"""Whether a derivative or a batch of another kind than reverse mode is at work."""
+"""Whether a derivative or a batch of another kind than reverse mode is at work; operators of this project."""
 
 from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+from typing import Any
 
 import torch
 from torch import Tensor
 from torch.autograd import forward_ad
 
-__all__ = ["exporting", "transformed", "untracked"]
+__all__ = ["exporting", "operator", "transformed", "untracked"]
 
 
 def transformed() -> bool:
@@ -32,3 +36,24 @@ def untracked(*given: Tensor | None) -> bool:
     if torch.compiler.is_compiling() or transformed():
         return False
     return not (torch.is_grad_enabled() and any(part is not None and part.requires_grad for part in given))
+
+
+def operator(name: str) -> Callable[[Callable[..., Any]], Any]:
+    """``torch.library.custom_op`` without writes to its arguments, that starts without PyTorch's compiler.
+
+    The first call of any such operator imports ``torch._dynamo``, for two seconds of computing, to keep it
+    out of the operator's code. Where nothing else has imported it there is nothing to keep out. Releases of
+    torch that keep their implementations elsewhere get an ordinary operator. (torch 2.5 to 2.13,
+    https://github.com/pytorch/pytorch/blob/v2.9.0/torch/_library/custom_ops.py.)
+    """
+
+    def registered(function: Callable[..., Any]) -> Any:
+        made = torch.library.custom_op(name, mutates_args=())(function)
+        kept = getattr(made, "_backend_fns", None)
+        if isinstance(kept, dict) and callable(kept_out := kept.get(None)):
+            kept[None] = lambda *given, **keywords: (
+                kept_out if "torch._dynamo" in sys.modules else function
+            )(*given, **keywords)
+        return made
+
+    return registered

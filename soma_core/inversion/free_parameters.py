@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from scipy.stats import qmc
 from torch import Tensor
 
 from soma_core.errors import InputError
@@ -142,6 +141,8 @@ class FreeParameters:
         bounded = np.flatnonzero(np.isfinite(self.upper))
         points = np.tile(self.start, (count if len(bounded) else 0, 1))
         if len(points):
+            from scipy.stats import qmc  # takes half a second
+
             unit = qmc.Halton(len(bounded), scramble=False).random(count + 1)[1:]  # the first is a corner
             span = self.upper[bounded] - self.lower[bounded]
             points[:, bounded] = self.lower[bounded] + unit * span

@@ -6,6 +6,7 @@ import torch
 import warp as wp
 from torch import Tensor
 
+from soma_core.geometry.torch_func import operator
 from soma_core.kernels._lanes import as_rows, in_threads, launch, row_of, worker_count, working_rows
 from soma_core.kernels._native import HALVES, native, transposing
 from soma_core.kernels._residual_phases import TILE
@@ -107,7 +108,7 @@ _PULL = (
 )
 
 
-@torch.library.custom_op("soma_core::skin_bodies", mutates_args=())
+@operator("soma_core::skin_bodies")
 def _skin(points: Tensor, transforms: Tensor, start: Tensor, column: Tensor, value: Tensor) -> Tensor:
     return skin_bodies(points, transforms, Blend(start, column, value))
 
@@ -117,7 +118,7 @@ def _(points, transforms, start, column, value):
     return points.new_empty(transforms.shape[0], points.shape[1], 3)
 
 
-@torch.library.custom_op("soma_core::skin_bodies_backward", mutates_args=())
+@operator("soma_core::skin_bodies_backward")
 def _skin_backward(
     grad: Tensor, points: Tensor, transforms: Tensor, start: Tensor, column: Tensor, value: Tensor,
     wanted: bool,

@@ -7,10 +7,10 @@ read once for the group, and rest shapes are moved by the correctives on the way
 
 import functools
 
-import torch
 import warp as wp
 from torch import Tensor
 
+from soma_core.geometry.torch_func import operator
 from soma_core.kernels._lanes import in_threads
 from soma_core.kernels._native import native
 from soma_core.kernels._patch_text import patch_text
@@ -108,7 +108,7 @@ def _rows(tensor: Tensor) -> tuple[Tensor, int]:
     return tensor, 0 if len(tensor) == 1 else tensor[0].numel()
 
 
-@torch.library.custom_op("soma_core::pose_bodies", mutates_args=())
+@operator("soma_core::pose_bodies")
 def _pose_bodies(
     rotations: Tensor, translation: Tensor, bind_world: Tensor, bone_scale: Tensor | None, ints: Tensor,
     reals: Tensor, batch: int, helpers: int, activations: int, absolute: bool,
@@ -154,7 +154,7 @@ def _(
     )
 
 
-@torch.library.custom_op("soma_core::skin_patches", mutates_args=())
+@operator("soma_core::skin_patches")
 def _skin_patches(
     points: Tensor, skin: Tensor, active: Tensor | None, ints: Tensor, shorts: Tensor, reals: Tensor,
     patches: int,

@@ -6,10 +6,10 @@ On CUDA, dozens of products of 3x3 matrices would each be a launch of their own.
 import functools
 from types import SimpleNamespace
 
-import torch
 import warp as wp
 from torch import Tensor
 
+from soma_core.geometry.torch_func import operator
 from soma_core.kernels._runtime import as_warp, launching, scalar_name
 
 __all__ = ["fitted_world", "to_bind_pose"]
@@ -98,7 +98,7 @@ def _kernels(scalar: str) -> SimpleNamespace:
     return SimpleNamespace(vec3=vec3, mat33=mat33, mat44=mat44, mat34=mat34, assemble=assemble, rebind=rebind)
 
 
-@torch.library.custom_op("soma_core::fitted_world", mutates_args=())
+@operator("soma_core::fitted_world")
 def _fitted_world(displacement: Tensor, source: Tensor, bind_rotation: Tensor, joints: Tensor) -> Tensor:
     kernels, batch, count = _kernels(scalar_name(joints.dtype)), len(joints), len(source)
     out = joints.new_empty(batch, count, 4, 4)
@@ -119,7 +119,7 @@ def _(displacement, source, bind_rotation, joints):
     return joints.new_empty(joints.shape[0], source.shape[0], 4, 4)
 
 
-@torch.library.custom_op("soma_core::to_bind_pose", mutates_args=())
+@operator("soma_core::to_bind_pose")
 def _to_bind_pose(
     fitted: Tensor, parents: Tensor, bind_rotation: Tensor, parent_orient: Tensor, bind_parent_turn: Tensor
 ) -> tuple[Tensor, Tensor]:

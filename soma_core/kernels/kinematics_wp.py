@@ -7,6 +7,7 @@ import torch
 import warp as wp
 from torch import Tensor
 
+from soma_core.geometry.torch_func import operator
 from soma_core.kernels._runtime import as_warp, launching, scalar_name
 
 __all__ = ["forward_kinematics"]
@@ -37,7 +38,7 @@ def _kernels(scalar: str) -> SimpleNamespace:
     return SimpleNamespace(vec3=vec3, mat33=mat33, walk=walk)
 
 
-@torch.library.custom_op("soma_core::forward_kinematics", mutates_args=())
+@operator("soma_core::forward_kinematics")
 def _walk(relative: Tensor, offsets: Tensor, order: Tensor, parents: Tensor) -> tuple[Tensor, Tensor]:
     kernels = _kernels(scalar_name(relative.dtype))
     turns = torch.empty_like(relative, memory_format=torch.contiguous_format)
@@ -64,7 +65,7 @@ def _(relative, offsets, order, parents):
     )
 
 
-@torch.library.custom_op("soma_core::forward_kinematics_backward", mutates_args=())
+@operator("soma_core::forward_kinematics_backward")
 def _walk_backward(
     turns_grad: Tensor, positions_grad: Tensor, relative: Tensor, offsets: Tensor, turns: Tensor,
     positions: Tensor, order: Tensor, parents: Tensor,

@@ -13,6 +13,7 @@ import warp as wp
 from torch import Tensor
 
 from soma_core.geometry.kabsch import PRIOR_STRENGTH
+from soma_core.geometry.torch_func import operator
 from soma_core.kernels._runtime import as_warp, launching, scalar_name
 from soma_core.kernels.rotation_functions_wp import bone_functions, kabsch_function
 
@@ -254,7 +255,7 @@ def _fan_gradient(types: SimpleNamespace, module: wp.Module) -> wp.Function:
     return fan_gradient
 
 
-@torch.library.custom_op("soma_core::fit_displacements", mutates_args=())
+@operator("soma_core::fit_displacements")
 def _fit(
     joints: Tensor, covariances: Tensor, bind: Tensor, pivots: Tensor, children: Tensor
 ) -> Tensor:  # fmt: skip
@@ -280,7 +281,7 @@ def _(joints, covariances, bind, pivots, children):
     return joints.new_empty(joints.shape[0], pivots.shape[0], 3, 3)
 
 
-@torch.library.custom_op("soma_core::fit_displacements_backward", mutates_args=())
+@operator("soma_core::fit_displacements_backward")
 def _fit_backward(
     grad: Tensor, joints: Tensor, covariances: Tensor, bind: Tensor, pivots: Tensor, children: Tensor
 ) -> tuple[Tensor, Tensor]:  # fmt: skip

@@ -8,6 +8,7 @@ import warp as wp
 from torch import Tensor
 
 from soma_core.geometry.sparse import Csr
+from soma_core.geometry.torch_func import operator
 from soma_core.kernels._runtime import as_warp, launching, scalar_name
 
 __all__ = ["skin"]
@@ -74,7 +75,7 @@ def _kernels(scalar: str) -> SimpleNamespace:
     )  # fmt: skip
 
 
-@torch.library.custom_op("soma_core::skin", mutates_args=())
+@operator("soma_core::skin")
 def _skin(
     points: Tensor, transforms: Tensor, crow: Tensor, col: Tensor, val: Tensor,
     t_crow: Tensor, t_col: Tensor, t_val: Tensor,
@@ -101,7 +102,7 @@ def _(points, transforms, crow, col, val, t_crow, t_col, t_val):
     return torch.empty_like(points, memory_format=torch.contiguous_format)
 
 
-@torch.library.custom_op("soma_core::skin_backward", mutates_args=())
+@operator("soma_core::skin_backward")
 def _skin_backward(
     grad: Tensor, points: Tensor, transforms: Tensor, crow: Tensor, col: Tensor, val: Tensor,
     t_crow: Tensor, t_col: Tensor, t_val: Tensor,
