@@ -115,8 +115,8 @@ class ComposedRestShape(torch.nn.Module):
         coefficients = self.coefficients(params)
         rows, many = coefficients, len(self.basis)
         if exporting():  # engines add up in one run, which rounds three times as much
-            pairs = zip(self.basis.split(_SUMMED, 1), rows.split(_SUMMED, 1), strict=True)
-            stacked = self.template + sum(part @ column.T for part, column in pairs)
+            pairs = zip(self.basis.T.split(_SUMMED), rows.split(_SUMMED, 1), strict=True)
+            stacked = (self.template.T + sum(column @ part for part, column in pairs)).T
         elif rows.device.type != "cpu":  # a body's numbers lie together, as the kernels that follow read them
             stacked = torch.addmm(self.template.flatten(), rows, self.basis.T).T
         elif rows.shape[0] == 1:  # of one column MKL makes pieces four times as fast as the whole
