@@ -164,14 +164,18 @@ class FusedPose(torch.nn.Module):
         *,
         absolute: bool,
         bone_scale: Tensor | None,
+        skinned: bool = True,
     ) -> tuple[Tensor, Tensor, Tensor, Tensor | None]:
-        """World transforms, joints, skinning transforms, and activations where there are any."""
+        """World transforms, joints, skinning transforms, and activations where there are any.
+
+        Unless `skinned`, the last two are left out.
+        """
         from soma_core.kernels.fused_pose_wp import pose_bodies
 
         world, joints, skin, active = pose_bodies(
             rotations, translation, bind_world, bone_scale, self.ints, self.reals,
             batch=len(translation), helpers=self.helper_count, activations=self.active_count,
-            absolute=absolute,
+            absolute=absolute, skinned=skinned,
         )  # fmt: skip
         return world, joints, skin, active if self.active_count else None
 

@@ -146,16 +146,18 @@ _TRANSFORMS = """
         const R *t = turn + 9 * j + 3 * r, *o = orient + 9 * j, *w = bind + 16 * j;
         R m[3], s[3], shift = place[3 * j + r];
         for (int c = 0; c < 3; c++) m[c] = t[0] * o[c] + t[1] * o[3 + c] + t[2] * o[6 + c];
-        for (int c = 0; c < 3; c++) s[c] = m[0] * w[4 * c] + m[1] * w[4 * c + 1] + m[2] * w[4 * c + 2];
-        for (int c = 0; c < 3; c++) spin[9 * j + 3 * r + c] = s[c];
         R* to = world.data + ((long long)index * J + j) * 16 + 4 * r;
         to[0] = m[0]; to[1] = m[1]; to[2] = m[2]; to[3] = shift;
         if (r == 2) { to[4] = 0; to[5] = 0; to[6] = 0; to[7] = 1; }
         if (j > 0) joints.data[((long long)index * (J - 1) + j - 1) * 3 + r] = shift;
+        if (!skinned) continue;
+        for (int c = 0; c < 3; c++) s[c] = m[0] * w[4 * c] + m[1] * w[4 * c + 1] + m[2] * w[4 * c + 2];
+        for (int c = 0; c < 3; c++) spin[9 * j + 3 * r + c] = s[c];
         to = skin.data + ((long long)index * (J + H) + j) * 12 + 4 * r;
         to[0] = s[0]; to[1] = s[1]; to[2] = s[2];
         to[3] = shift - (s[0] * w[3] + s[1] * w[7] + s[2] * w[11]);
     }
+    if (!skinned) return;
     for (int e = lane; e < (A > 0 ? 6 * J : 0); e += width) {
         int j = e / 6, r = e % 6 / 2, c = e % 2;
         R f = 0;

@@ -36,9 +36,9 @@ def _body_kernel(scalar: str) -> wp.Kernel:
 
     def pose_body(
         index: int, rotations: numbers, rotation_stride: int, axis_angle: int, absolute: int,
-        translation: numbers, translation_stride: int, bind_world: numbers, bind_stride: int, scaled: int,
-        bone_scale: numbers, scale_stride: int, ints: _ints, reals: numbers, world: numbers, joints: numbers,
-        skin: numbers, active: numbers,
+        skinned: int, translation: numbers, translation_stride: int, bind_world: numbers, bind_stride: int,
+        scaled: int, bone_scale: numbers, scale_stride: int, ints: _ints, reals: numbers, world: numbers,
+        joints: numbers, skin: numbers, active: numbers,
     ):  # fmt: skip
         ...
 
@@ -47,14 +47,14 @@ def _body_kernel(scalar: str) -> wp.Kernel:
     @wp.kernel(module=wp.get_module(f"soma_pose_bodies_{scalar}"), enable_backward=False, grid_stride=False)
     def bodies(
         threads: int, first: int, rotations: numbers, rotation_stride: int, axis_angle: int, absolute: int,
-        translation: numbers, translation_stride: int, bind_world: numbers, bind_stride: int, scaled: int,
-        bone_scale: numbers, scale_stride: int, ints: _ints, reals: numbers, world: numbers, joints: numbers,
-        skin: numbers, active: numbers,
+        skinned: int, translation: numbers, translation_stride: int, bind_world: numbers, bind_stride: int,
+        scaled: int, bone_scale: numbers, scale_stride: int, ints: _ints, reals: numbers, world: numbers,
+        joints: numbers, skin: numbers, active: numbers,
     ):  # fmt: skip
         pose_body(
-            first + wp.tid() // threads, rotations, rotation_stride, axis_angle, absolute, translation,
-            translation_stride, bind_world, bind_stride, scaled, bone_scale, scale_stride, ints, reals,
-            world, joints, skin, active,
+            first + wp.tid() // threads, rotations, rotation_stride, axis_angle, absolute, skinned,
+            translation, translation_stride, bind_world, bind_stride, scaled, bone_scale, scale_stride, ints,
+            reals, world, joints, skin, active,
         )  # fmt: skip
 
     return bodies
@@ -111,15 +111,11 @@ def _rows(tensor: Tensor) -> tuple[Tensor, int]:
 @operator("soma_core::pose_bodies")
 def _pose_bodies(
     rotations: Tensor, translation: Tensor, bind_world: Tensor, bone_scale: Tensor | None, ints: Tensor,
-    reals: Tensor, batch: int, helpers: int, activations: int, absolute: bool,
+    reals: Tensor, batch: int, helpers: int, activations: int, absolute: bool, skinned: bool,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:  # fmt: skip
-    joint_count = bind_world.shape[1]
-    world = rotations.new_empty(batch, joint_count, 4, 4)
-    joints = rotations.new_empty(batch, joint_count - 1, 3)
-    skin = rotations.new_empty(batch, joint_count + helpers, 3, 4)
-    active = rotations.new_empty(batch, max(activations, 1))
+    found = world, joints, skin, active = _empty(rotations, bind_world, batch, helpers, activations, skinned)
     if not batch:
-        return world, joints, skin, active
+        return found
     axis_angle = rotations.ndim == 3
     rotations, rotation_stride = _rows(rotations)
     translation, translation_stride = _rows(translation)
@@ -127,7 +123,7 @@ def _pose_bodies(
     scaled = bone_scale is not None
     stretch, scale_stride = _rows(bone_scale) if scaled else (reals, 0)
     given = [
-        _flat(rotations), rotation_stride, int(axis_angle), int(absolute), _flat(translation),
+        _flat(rotations), rotation_stride, int(axis_angle), int(absolute), int(skinned), _flat(translation),
         translation_stride, _flat(bind_world), bind_stride, int(scaled), _flat(stretch), scale_stride,
         as_warp(ints), as_warp(reals), _flat(world), _flat(joints), _flat(skin), _flat(active),
     ]  # fmt: skip
@@ -138,20 +134,28 @@ def _pose_bodies(
             _launch(kernel, part.stop - part.start, _BODY_THREADS, [part.start, *given], device)
 
     in_threads(run, batch, rotations)
-    return world, joints, skin, active
+    return found
+
+
+def _empty(
+    like: Tensor, bind_world: Tensor, batch: int, helpers: int, activations: int, skinned: bool
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Memory for what comes out."""
+    joint_count = bind_world.shape[1]
+    return (
+        like.new_empty(batch, joint_count, 4, 4),
+        like.new_empty(batch, joint_count - 1, 3),
+        like.new_empty(batch, joint_count + helpers if skinned else 0, 3, 4),
+        like.new_empty(batch, max(activations, 1) if skinned else 0),
+    )
 
 
 @_pose_bodies.register_fake
 def _(
-    rotations, translation, bind_world, bone_scale, ints, reals, batch, helpers, activations, absolute
+    rotations, translation, bind_world, bone_scale, ints, reals, batch, helpers, activations, absolute,
+    skinned,
 ):  # fmt: skip
-    joint_count = bind_world.shape[1]
-    return (
-        rotations.new_empty(batch, joint_count, 4, 4),
-        rotations.new_empty(batch, joint_count - 1, 3),
-        rotations.new_empty(batch, joint_count + helpers, 3, 4),
-        rotations.new_empty(batch, max(activations, 1)),
-    )
+    return _empty(rotations, bind_world, batch, helpers, activations, skinned)
 
 
 @operator("soma_core::skin_patches")
@@ -190,7 +194,7 @@ def _(points, skin, active, ints, shorts, reals, patches):
 
 def pose_bodies(
     rotations: Tensor, translation: Tensor, bind_world: Tensor, bone_scale: Tensor | None, ints: Tensor,
-    reals: Tensor, *, batch: int, helpers: int, activations: int, absolute: bool,
+    reals: Tensor, *, batch: int, helpers: int, activations: int, absolute: bool, skinned: bool = True,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:  # fmt: skip
     """World transforms (B, J, 4, 4), joints (B, J - 1, 3), skinning transforms (B, J + H, 3, 4), activations.
 
@@ -205,10 +209,12 @@ def pose_bodies(
         ints, reals: tables from ``animation.fused``.
         batch, helpers, activations: B, H and A.
         absolute: `rotations` are local ones in the rig's own axes.
+        skinned: False leaves out what only skin needs; there are no skinning transforms and activations then.
     """
     return _pose_bodies(
-        rotations, translation, bind_world, bone_scale, ints, reals, batch, helpers, activations, absolute
-    )
+        rotations, translation, bind_world, bone_scale, ints, reals, batch, helpers, activations, absolute,
+        skinned,
+    )  # fmt: skip
 
 
 def skin_patches(

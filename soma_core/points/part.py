@@ -141,8 +141,9 @@ class BodyPart(torch.nn.Module):
         if layer._fusible(*body[:4]):
             assert layer.fused is not None
             world, joints, skin, _ = layer.fused._bodies(
-                identity.bind_world, *body[1:3], absolute=absolute, bone_scale=body.bone_scale
-            )
+                identity.bind_world, *body[1:3], absolute=absolute, bone_scale=body.bone_scale,
+                skinned=self.skinning is not None,
+            )  # fmt: skip
         else:
             body = body._replace(relative=as_matrices(body.relative))
             world = layer.posing.transforms(body, absolute=absolute)

@@ -256,9 +256,15 @@ def test_operators_are_registered_soundly(layer):
     fused, identity = twin.fused, twin.identity(shapes(layer, 2))
     rotations, translation = poses(layer, 2)
     given = (rotations, translation, identity.bind_world, None, fused.ints, fused.reals, 2)
-    given = (*given, fused.helper_count, fused.active_count, False)
-    torch.library.opcheck(torch.ops.soma_core.pose_bodies.default, given)
-    _, _, skin, active = torch.ops.soma_core.pose_bodies(*given)
+    whole = (*given, fused.helper_count, fused.active_count, False, True)
+    bare = (*whole[:-1], False)
+    for given in (whole, bare):
+        torch.library.opcheck(torch.ops.soma_core.pose_bodies.default, given)
+    world, joints, none, _ = torch.ops.soma_core.pose_bodies(*bare)
+    same_world, same_joints, skin, active = torch.ops.soma_core.pose_bodies(*whole)
+    assert torch.equal(world, same_world)
+    assert torch.equal(joints, same_joints)
+    assert none.numel() == 0
     tables = fused.patches
     given = (identity.rest, skin, active, tables.ints, tables.shorts, tables.reals, tables.count)
     torch.library.opcheck(torch.ops.soma_core.skin_patches.default, given)
