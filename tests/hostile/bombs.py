@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import io
 import json
 import pickle
@@ -300,6 +301,7 @@ def _archives() -> Iterator[tuple[str, bytes | Callable[[], bytes]]]:
     yield "npz of several bombs below the limit", lambda: _several_bombs(200_000)
 
 
+@functools.cache
 def _several_bombs(frames: int) -> bytes:
     stream = io.BytesIO()
     with zipfile.ZipFile(stream, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
