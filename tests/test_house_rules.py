@@ -118,7 +118,7 @@ PUBLIC_NAMES = {
         atomic_arrays atomic_write
         axis_angle_to_matrix
         cached_arrays check closest_point_on_triangle content_key data_dir file_sha256 hookimpl model_folders
-        open_npz_file pose_skinned read_obj read_pickled_arrays refuse_unreadable write_obj
+        numbers_of_text open_npz_file pose_skinned read_obj read_pickled_arrays refuse_unreadable write_obj
     """,
     "soma_core.testing": """
         Context Report check_backend conformance_suite

@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from soma_core.geometry.barycentric import closest_point_on_triangle
     from soma_core.geometry.rotations import axis_angle_to_matrix
     from soma_core.io.pickled_arrays import read_pickled_arrays
+    from soma_core.io.text_numbers import numbers_of_text
     from soma_core.native.skinned import pose_skinned
     from soma_core.npz import open_npz_file
     from soma_core.obj import read_obj, write_obj
@@ -88,6 +89,7 @@ __all__ = [
     "file_sha256",
     "hookimpl",
     "model_folders",
+    "numbers_of_text",
     "open_npz_file",
     "pose_skinned",
     "read_obj",
@@ -115,6 +117,7 @@ _HOMES = {
     "soma_core.files": ["refuse_unreadable"],
     "soma_core.npz": ["open_npz_file"],
     "soma_core.io.pickled_arrays": ["read_pickled_arrays"],
+    "soma_core.io.text_numbers": ["numbers_of_text"],
     # Meshes and rotations
     "soma_core.obj": ["read_obj", "write_obj"],
     "soma_core.topology.closest": ["ClosestFaces"],

@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 
 from soma_core import AssetError
+from soma_core.plugin import numbers_of_text
 
 __all__ = ["Bones", "base_mesh", "bones", "local_targets", "skin_weights", "target"]
 
@@ -178,8 +179,8 @@ def target(path: Path, count: int) -> tuple[np.ndarray, np.ndarray]:
         AssetError: the file is missing, damaged, or names vertices that the base mesh does not have.
     """
     try:
-        with gzip.open(path, "rt", encoding="ascii") as stream:
-            table = np.array(stream.read().split(), dtype=float).reshape(-1, 4)
+        with gzip.open(path) as stream:
+            table = numbers_of_text(stream.read()).reshape(-1, 4)
     except (OSError, EOFError, ValueError) as error:
         raise AssetError(path, cause=f"unreadable morph target ({error})", fix=_FIX) from error
     ids = table[:, 0].astype(np.int64)
