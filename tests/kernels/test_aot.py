@@ -26,14 +26,20 @@ FOLDER = Path(soma_core.kernels.__file__).parent
 ROOT = FOLDER.parents[1]
 FILES = sorted(FOLDER.glob("*_wp.py"))
 
+LONG = ("pose_steps_wp", "pose_solver_wp", "skeleton_fit_wp", "twist_share_wp")
+"""Files that take a compiler for CUDA four to fifteen seconds each, three fifths of all."""
+
 CPU_ONLY = {"descent_wp.descent": "a GPU takes the steps of a descent one by one, with blocks for patches"}
 """Kernels without a version for CUDA, as ``file_wp.kernel``, and why it takes another one there."""
 
 
 def defined_kernels(path: Path) -> dict[int, str]:
     """Kernels in a source file: number of the line of their decorator, and ``file.kernel``."""
-    found = {}
-    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+    found: dict[int, str] = {}
+    text = path.read_text(encoding="utf-8")
+    if "kernel" not in text:
+        return found
+    for node in ast.walk(ast.parse(text)):
         for decorator in getattr(node, "decorator_list", ()):
             called = decorator.func if isinstance(decorator, ast.Call) else decorator
             if ast.unparse(called).rpartition(".")[2] == "kernel":
@@ -88,11 +94,19 @@ def _compiler():
 
 
 @pytest.mark.parametrize("path", FILES, ids=lambda path: path.stem)
-def test_compiles_for_cuda(path, tmp_path):
+def test_every_kernel_is_compiled_here(path):
     made = made_kernels(importlib.import_module(f"soma_core.kernels.{path.stem}"))
     covered = {line for name, line in map(line_of, made) if name == str(path)}
     missed = {name for line, name in defined_kernels(path).items() if line not in covered} - CPU_ONLY.keys()
     assert not missed, f"no cached factory makes {missed} of `scalar`, `lanes` and switches; see {__file__}"
+
+
+@pytest.mark.parametrize(
+    "path",
+    [pytest.param(path, marks=[pytest.mark.slow] * (path.stem in LONG), id=path.stem) for path in FILES],
+)
+def test_compiles_for_cuda(path, tmp_path):
+    made = made_kernels(importlib.import_module(f"soma_core.kernels.{path.stem}"))
     for module in {kernel.module for kernel in made}:
         (binary,) = wp.compile_aot_module(module, arch=[ARCHITECTURE], module_dir=tmp_path)
         assert binary.parent == tmp_path

@@ -45,10 +45,12 @@ def arguments(batch=3, dtype=torch.float64):
     return relative, offsets, module.order, module.tree
 
 
-def test_gradcheck():
+def test_gradcheck(fast_mode):
     relative, offsets, order, tree = arguments(2)
     inputs = (relative.requires_grad_(), offsets.detach().requires_grad_())
-    assert torch.autograd.gradcheck(lambda r, o: forward_kinematics(r, o, order, tree), inputs)
+    assert torch.autograd.gradcheck(
+        lambda r, o: forward_kinematics(r, o, order, tree), inputs, fast_mode=fast_mode
+    )
 
 
 def test_backward_through_one_output_alone():
