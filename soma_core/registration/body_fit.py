@@ -8,18 +8,18 @@ and the scale shrinks.
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
 import scipy.linalg
-from scipy.spatial.transform import Rotation
 
 from soma_core.registration.body_model import BodyModel, BodyPose
 from soma_core.registration.digits import Digits, digit_guide
 from soma_core.registration.surface import Surface
 
-__all__ = ["BodyFit", "fit_body"]
+__all__ = ["BodyFit", "fit_body", "place_hands"]
 
 _SHAPE_STRENGTH = 2e-3
 """Residual [m] of all vertices that one standard deviation of a component is worth."""
@@ -35,6 +35,16 @@ _TANGENT = 0.1
 
 _HOLD = 30.0
 """Weight of a landmark and of the middle of a part of a finger against a vertex."""
+
+_ASTRAY = 6.5e-3
+"""Mean distance [m] of the parts of a hand's fingers from where they belong beyond which it is placed anew;
+open hands have 4 to 6, relaxed ones 7."""
+
+_ROUND = 5
+"""Vertices of a part of a finger from which on their mean is its middle; a mesh of 2,000 faces has one."""
+
+_HAND_STEPS, _HAND_TURN, _HAND_STIFF = 24, 0.3, 4e-3
+"""Steps of a hand, how far one turns a joint [rad], and what a turn of one radian is worth [m]."""
 
 _ACROSS = math.sqrt(1 + _TANGENT**2) - _TANGENT
 """What the distance across it weighs more: the root of ``n n^T + t^2`` is ``t + _ACROSS n n^T``."""
@@ -122,6 +132,48 @@ def fit_body(
         pose = model.moved_by(pose, step)
     vertices, _ = model.evaluate(pose)
     return BodyFit(pose=pose, vertices=vertices, cost=cost)
+
+
+def place_hands(model: BodyModel, pose: BodyPose, digits: Digits) -> BodyPose:
+    """Turn arms, hands and fingers until fingers far from their places are there: closest points do not.
+
+    Args:
+        model: the body.
+        pose: hands roughly in place.
+        digits: fingers of the surface.
+    """
+    for limb, middles in digits.middles.items():
+        known = limb.endswith("Hand") and digits.least(limb) >= _ROUND
+        if known and np.linalg.norm(_apart(model, pose, limb, middles), axis=1).mean() > _ASTRAY:
+            pose = _placed_hand(model, pose, limb, middles)
+    return pose
+
+
+def _apart(model: BodyModel, pose: BodyPose, limb: str, middles: np.ndarray) -> np.ndarray:
+    """From the parts of a hand's fingers to where they belong, (5 x 4, 3) [m]."""
+    vertices, _ = model.evaluate(pose)
+    ids, shares = digit_guide().rings(limb, len(vertices))
+    return middles - np.einsum("mk,mkc->mc", shares, vertices[ids])
+
+
+def _placed_hand(model: BodyModel, start: BodyPose, limb: str, middles: np.ndarray) -> BodyPose:
+    names = [model.layer.joint_names[joint] for joint in model.joints]
+    side = limb.removesuffix("Hand")
+    own = np.array([bool(re.match(f"{side}(Arm|ForeArm|Hand)", name)) for name in names])
+    columns = np.flatnonzero(np.repeat(own, 3))
+    pose, step = start, np.zeros(3 * len(names) + 3 + model.count)
+    for _ in range(_HAND_STEPS):
+        vertices, joints = model.evaluate(pose)
+        held = _held(vertices, *digit_guide().rings(limb, len(vertices)), middles)
+        rows = _jacobian(model, held, vertices[:, None] - joints[None, model.joints], None)
+        rows = (held.normals[:, None] @ rows).squeeze(1)[:, columns]
+        gap = (held.normals * (held.targets - held.points)).sum(1)
+        away = model.turned(start, pose)[own].ravel()
+        matrix = rows.T @ rows + _HAND_STIFF**2 * np.eye(len(columns))
+        turn = np.linalg.solve(matrix, rows.T @ gap - _HAND_STIFF**2 * away)
+        step[columns] = turn * min(1.0, _HAND_TURN / np.abs(turn).max())
+        pose = model.moved_by(pose, step)
+    return pose
 
 
 def _robust_cost(pull: _Pull, scale: float) -> float:
@@ -230,15 +282,12 @@ def _add_priors(
 ) -> None:
     """Pull rotations to their start and the shape to the mean; a little damping for all."""
     count, scale = len(model.joints), len(model.skin)
-    world = model.world_turns(pose)
-    for place, joint in enumerate(model.joints):
-        above = world[model.parents[joint]] if joint else np.eye(3)
-        away = Rotation.from_matrix(pose.rotations[joint] @ start.rotations[joint].T).as_rotvec()
+    for place, away in enumerate(model.turned(start, pose)):
         stiffness = model.stiffness[place] * (ends if model.ends[place] else 1.0)
         strength = scale * (_POSE_STRENGTH * stiffness) ** 2
         block = slice(3 * place, 3 * place + 3)
         matrix[block, block] += strength * np.eye(3)
-        right[block] -= strength * (above @ away)
+        right[block] -= strength * away
     if free:
         strength = scale * _SHAPE_STRENGTH**2 / model.count
         matrix[-free:, -free:] += strength * np.eye(free)

@@ -117,6 +117,14 @@ class BodyModel:
         turned = _MIRROR[:, None] * pose.rotations[self.partner] * _MIRROR
         return replace(pose, rotations=np.where(copied[:, None, None], turned, pose.rotations))
 
+    def turned(self, start: BodyPose, pose: BodyPose) -> np.ndarray:
+        """Turns [rad] about world axes (joints, 3) that lead from the rotations of one pose to another's."""
+        world = self.world_turns(pose)
+        above = world[self.parents[self.joints]]
+        above[0] = np.eye(3)
+        away = (pose.rotations @ start.rotations.transpose(0, 2, 1))[self.joints]
+        return np.einsum("jab,jb->ja", above, Rotation.from_matrix(away).as_rotvec())
+
     def spun(self, pose: BodyPose, side: str, angle: float) -> BodyPose:
         """The same body, the hand of a `side` turned about the normal of its palm by `angle` [rad]."""
         _, joints = self.evaluate(pose)

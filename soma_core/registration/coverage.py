@@ -14,7 +14,7 @@ from soma_core.registration.surface import Surface
 from soma_core.rig.mesh import CanonicalMesh
 from soma_core.rig.skeleton import Rig
 
-__all__ = ["COVERED", "MATCHED", "Share", "coverage", "faults", "matches", "slid", "without_digits"]
+__all__ = ["COVERED", "MATCHED", "Share", "coverage", "faults", "lost", "matches", "slid", "without_digits"]
 
 _NEAR = 0.0025
 """Distance between wrap and skin, of the body's diagonal, up to which they lie on each other: 5 mm of 2 m.
@@ -48,6 +48,10 @@ whose fingers touch, are one as far as that."""
 _STRETCHED, _SLID = 2.0, 0.01
 """Stretch of an edge of the head, of their median, and the share of edges beyond it that makes a wrap unfit.
 Wraps of people, artists' too, have 0.1 to 0.4 %; a face that lies 40 mm too low has 2 %."""
+
+_LOST, _SOLE = 0.5, 0.75
+"""Share of a segment, and of a foot, that may lie over holes: armpits and soles of scans do. A foot without
+its lowest 12 mm has 0.66, a hand that is cut off 1."""
 
 _SEGMENTS = (
     ("head", "Head|Neck|Jaw|Eye"),
@@ -198,6 +202,7 @@ def faults(
     extremities: Mapping[str, int | None],
     *,
     told: Collection[str] = (),
+    gone: Collection[str] = (),
 ) -> tuple[str, ...]:
     """What makes a wrap unfit for use, one sentence each.
 
@@ -208,22 +213,26 @@ def faults(
         matched: of :func:`matches`.
         extremities: limb -> how many stand out of the native skin.
         told: limbs whose fingers a user told by landmarks.
+        gone: segments that lie over holes, of :func:`lost`.
     """
     found = [
-        f"{limb}: {count} fingers stand out of the mesh, not 5, so that none can be told from another"
+        f"{limb}: it touches another part of the mesh, so that no finger can be told"
+        if count is None
+        else f"{limb}: {count} fingers stand out of the mesh, not 5, so that none can be told from another"
         for limb, count in extremities.items()
-        if limb.endswith("Hand") and limb not in told and (count or 0) > _MITTEN and count != 5
+        if limb.endswith("Hand") and limb not in {*told, *gone}
+        if count != 5 and (count is None or count > _MITTEN)
     ]
     found += [
         f"{name}: {1 - share.wrap:.0%} lies beside its own, of which {1 - share.native:.0%} is without it"
         for name, share in matched.items()
-        if share.least < share.asked
+        if share.least < share.asked and name not in gone
     ]
     bare = {_digit_name(limb, i) for limb in LIMBS for i in range(5) if (extremities[limb] or 0) <= _MITTEN}
     found += [
         f"{name}: {1 - share.wrap:.0%} is off the mesh, {1 - share.native:.0%} of the mesh there is bare"
         for name, share in covered.items()
-        if share.least < share.asked and name not in bare
+        if share.least < share.asked and name not in bare and name not in gone
     ]
     return tuple(found)
 
@@ -249,10 +258,27 @@ def slid(wrap: np.ndarray, mesh: CanonicalMesh, rig: Rig, filled: np.ndarray) ->
     return (f"head: {share:.1%} of its edges are stretched more than {_STRETCHED:g} times: the face slid",)
 
 
+def lost(wrap: np.ndarray, surface: Surface, rig: Rig) -> dict[str, float]:
+    """Segments most of which lie over holes of the skin, such as a hand that is cut off, with their share.
+
+    Args:
+        wrap: (v, 3) [m].
+        surface: the native skin [m].
+        rig: canonical.
+    """
+    names, place = _segments(rig)
+    share = np.bincount(place, surface.closest(wrap).open) / np.bincount(place)
+    return {
+        name: float(part)
+        for name, part in zip(names, share, strict=True)
+        if part > (_SOLE if name.endswith("Foot") else _LOST)
+    }
+
+
 def without_digits(extremities: Mapping[str, int | None]) -> list[str]:
     """What is said of hands and feet whose fingers or toes do not stand apart."""
     return [
         f"{limb}: no separate {'fingers' if limb.endswith('Hand') else 'toes'}, {count or 'no'} stand out"
         for limb, count in extremities.items()
-        if count != 5 and (limb.endswith("Foot") or (count or 0) <= _MITTEN)
+        if count != 5 and (limb.endswith("Foot") or count in range(_MITTEN + 1))
     ]

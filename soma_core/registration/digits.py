@@ -121,6 +121,11 @@ class Digits:
         """The same without the middles that hold fingers."""
         return replace(self, middles={})
 
+    def least(self, limb: str) -> int:
+        """Vertices of the part with the fewest of all digits of a limb."""
+        parts = [(along > low) & (along <= high) for along in self.along[limb] for low, high in _PARTS]
+        return int(np.sum(parts, 1).min())
+
 
 class DigitGuide:
     """The canonical mesh's own digits, and those of any surface that the mesh lies near."""

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from soma_core.paths import shipped_assets
-from soma_core.registration.coverage import Share, coverage, faults, matches, slid
+from soma_core.registration.coverage import Share, coverage, faults, lost, matches, slid
 from soma_core.registration.digits import digit_guide
 from soma_core.registration.folds import flipped_triangles
 from soma_core.registration.register import Registration
@@ -84,6 +84,11 @@ def measure(found: Registration, mesh: CanonicalMesh) -> Quality:
     covered = coverage(wrap, surface, mesh, rig, found.filled)
     matched = matches(wrap, surface, digits, guide)
     back = 1000 * np.linalg.norm(own.closest(surface.vertices).points - surface.vertices, axis=1)
+    gone = lost(wrap, surface, rig)
+    said = faults(covered, matched, digits.counts, told=found.told, gone=gone)
+    said += slid(wrap, mesh, rig, found.filled)
+    if not found.skin.masked:  # what a user masked is known to be gone
+        said += tuple(f"{name}: {part:.0%} of it lies over a hole of the mesh" for name, part in gone.items())
     return Quality(
         distance=np.where(found.filled, np.nan, distance),
         uncovered=back,
@@ -92,7 +97,7 @@ def measure(found: Registration, mesh: CanonicalMesh) -> Quality:
         coverage=covered,
         digits=matched,
         extremities=digits.counts,
-        faults=faults(covered, matched, digits.counts, told=found.told) + slid(wrap, mesh, rig, found.filled),
+        faults=said,
     )
 
 

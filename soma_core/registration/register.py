@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import scipy.sparse
@@ -18,7 +18,7 @@ from soma_core.paths import shipped_assets
 from soma_core.plugin.spec import Axis, Unit
 from soma_core.progress import progress
 from soma_core.registration.alignment import find_starts
-from soma_core.registration.body_fit import BodyFit, fit_body
+from soma_core.registration.body_fit import BodyFit, fit_body, place_hands
 from soma_core.registration.body_model import BodyModel
 from soma_core.registration.coverage import without_digits
 from soma_core.registration.deform import Smoothness, deform
@@ -49,7 +49,7 @@ _SPIN, _CLEARLY = 0.3, 0.8
 """A finger's width at the fingertips [rad], and the share of the cost that makes spinning worth it."""
 
 _LOOKS = (1, 3)
-"""Stages before which fingers and toes are told apart."""
+"""Stages before which fingers and toes are told apart; before the last, hands are placed over theirs."""
 
 _HELD, _TOLD = 3, 4
 """Last stages in which parts of fingers are held where they belong, and in which skin keeps to its finger;
@@ -242,6 +242,8 @@ def _refine(
         if number in _LOOKS:
             digits = digit_guide().find(surface, fine.evaluate(fit.pose)[0], marks=marks)
             surface = surface.labelled(digits.labels)
+            if number == _LOOKS[-1]:
+                fit = replace(fit, pose=place_hands(model, fit.pose, digits))
         if number > _TOLD:
             digits, surface = None, surface.labelled(None)
         elif number > _HELD and digits is not None:

@@ -32,7 +32,7 @@ class Contact:
         normals: (m, 3) unit normals there, interpolated between vertices.
         faces: (m,) face ids.
         shares: (m, 3) barycentric coordinates in the face.
-        open: (m,) whether that is the rim of a hole that a mask cut: the point belongs to what is missing.
+        open: (m,) whether that is the rim of a hole: the point belongs to what is missing.
     """
 
     points: np.ndarray
@@ -48,7 +48,7 @@ class Surface:
     Args:
         vertices: (n, 3) [m].
         triangles: (t, 3), counter-clockwise seen from outside.
-        rim: (n,) whether a vertex lies on the rim of a hole that a mask cut; default none.
+        rim: (n,) whether a vertex lies on the rim of a hole; default none.
         labels: (n, 5) how far a vertex belongs to the fingers or toes of its limb; default not at all.
     """
 

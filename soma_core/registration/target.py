@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
+import functools
 import logging
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy.sparse
 from scipy.sparse.csgraph import connected_components
-from scipy.spatial import cKDTree
 
 from soma_core.errors import InputError
-from soma_core.geometry.mesh import enclosed_volume
+from soma_core.geometry.mesh import enclosed_volume, triangle_sides
 from soma_core.plugin.spec import Axis, Unit
 from soma_core.registration.surface import Surface
 from soma_core.topology.frames import METRES, METRIC, native_to_canonical
@@ -79,13 +79,23 @@ class Skin:
         vertices: (n, 3) native.
         triangles: (t, 3), seen counter-clockwise from outside.
         notes: what was left out or turned, for people.
-        rim: (n,) whether a vertex lies beside a face that was masked; None where none was.
+        masked: whether a user named vertices that are no skin.
     """
 
     vertices: np.ndarray
     triangles: np.ndarray
     notes: tuple[str, ...] = ()
-    rim: np.ndarray | None = None
+    masked: bool = False
+
+    @functools.cached_property
+    def rim(self) -> np.ndarray:
+        """(n,) whether a vertex lies on the rim of a hole, of a scan or of what was masked."""
+        _, place = np.unique(self.vertices, axis=0, return_inverse=True)
+        place = place.ravel()  # seams of a texture are no rims
+        ends = np.sort(place[triangle_sides(self.triangles)], 1)
+        keys, uses = np.unique(ends @ [len(place), 1], return_counts=True)
+        rim = np.unique(np.stack(np.divmod(keys[uses == 1], len(place))))
+        return np.isin(place, rim)
 
     def lighter(self) -> Skin:
         """The same skin with few enough faces to be fitted to; itself where it has no more."""
@@ -102,11 +112,8 @@ class Skin:
             return self
         faces = np.insert(self.triangles, 0, 3, axis=1).ravel()
         fewer = pyvista.PolyData(self.vertices, faces).decimate(1 - share)
-        vertices = np.asarray(fewer.points, np.float64)
-        nearest = cKDTree(self.vertices).query(vertices)[1]
-        rim = None if self.rim is None else self.rim[nearest]
         triangles = fewer.faces.reshape(-1, 4)[:, 1:].astype(np.int64)
-        return Skin(vertices=vertices, triangles=triangles, rim=rim)
+        return Skin(vertices=np.asarray(fewer.points, np.float64), triangles=triangles)
 
     def surface(self, frame: Frame) -> Surface:
         """The skin in metres, +Y up, +Z forward."""
@@ -146,10 +153,10 @@ def find_skin(vertices: np.ndarray, triangles: np.ndarray, *, masked: Sequence[i
     if enclosed_volume(points - points.mean(0), part) < 0:
         part = part[:, ::-1].copy()
         notes.append("faces point inwards; turned")
-    rim = None
-    if not kept.all():
-        rim = np.isin(used, triangles[~kept[triangles].all(1)])
-    return Skin(vertices=points, triangles=part, notes=tuple(notes), rim=rim)
+    skin = Skin(vertices=points, triangles=part, notes=tuple(notes), masked=not kept.all())
+    if skin.rim.any() and not skin.masked:
+        skin = replace(skin, notes=(*notes, "has holes; skin is drawn over them"))
+    return skin
 
 
 def _refusal(got: object, expected: object, fix: str) -> InputError:

@@ -2,18 +2,24 @@
 
 from __future__ import annotations
 
+import re
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from soma_core.layer import SomaLayer
-from soma_core.registration.body_fit import fit_body
+from soma_core.registration.body_fit import fit_body, place_hands
 from soma_core.registration.body_model import BodyModel
+from soma_core.registration.digits import digit_guide
 from soma_core.registration.surface import Surface
 
 ORTHONORMAL = 1e-9
 STEP_MM = 0.05  # second order of a step of 0.01 rad on a lever of a metre
 SIZE = 0.02  # shapes are no similarities
 SIDES_MM = 1.5  # the rig's two sides are mirror images only to a millimetre
+AWAY_MM, PLACED_MM = 40.0, 12.0  # of a hand half closed; each of its joints is bent by 29 degrees
+FEW = 12  # one vertex of so many is left of a hand
 SETTLED_MM = 5.0  # after the seven steps of the rough fit, from 140 mm away
 
 
@@ -87,6 +93,30 @@ def test_a_fit_finds_its_own_body_again(model: BodyModel) -> None:
     found = fit_body(model, surface, begin, scales=[0.2] * 4 + [0.1] * 3, ends=20.0)
     gap = np.linalg.norm(found.vertices - vertices, axis=1)[model.skin]
     assert 1000 * np.median(gap) < SETTLED_MM
+
+
+def test_a_hand_far_from_its_fingers_is_closed_over_them(model: BodyModel) -> None:
+    fine, names = BodyModel(SomaLayer("soma", lod="mid", procedural=False)), model.layer.joint_names
+    begin, step = model.start(0.8), np.zeros(3 * len(model.joints) + 3 + model.count)
+    fingers = [re.match("(Left|Right)Hand(Index|Middle|Ring|Pinky)", name) for name in names]
+    for place, joint in enumerate(model.joints):
+        if finger := fingers[joint]:
+            step[3 * place + 2] = -0.5 if finger[1] == "Left" else 0.5
+    truth, near = (model.moved_by(begin, bent * step) for bent in (1.0, 0.05))
+    surface = Surface(fine.evaluate(truth)[0], fine.triangles)
+    ours = np.array(fingers, bool)[model.rig.weights.toarray().argmax(1)]
+    digits = digit_guide().find(surface, fine.evaluate(begin)[0])
+    found = place_hands(model, begin, digits)
+    ends, starts, placed = (model.evaluate(pose)[0][ours] for pose in (truth, begin, found))
+    assert 1000 * np.median(np.linalg.norm(starts - ends, axis=1)) > AWAY_MM
+    assert 1000 * np.median(np.linalg.norm(placed - ends, axis=1)) < PLACED_MM
+    open_hand = Surface(fine.evaluate(begin)[0], fine.triangles)
+    assert place_hands(model, near, digit_guide().find(open_hand, fine.evaluate(near)[0])) is near
+    assert digits.least("LeftHand") > FEW
+    few = {
+        limb: np.where(np.arange(along.shape[1]) % FEW == 0, along, 0) for limb, along in digits.along.items()
+    }
+    assert place_hands(model, begin, replace(digits, along=few)) is begin  # too coarse for middles
 
 
 def test_rotations_stay_rotations_over_many_steps(model: BodyModel) -> None:

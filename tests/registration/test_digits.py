@@ -14,17 +14,20 @@ from soma_core.registration.coverage import (
     Share,
     coverage,
     faults,
+    lost,
     matches,
     slid,
     without_digits,
 )
 from soma_core.registration.digits import LIMBS, digit_guide
 from soma_core.registration.surface import Surface
+from soma_core.registration.target import Frame, find_skin
 from soma_core.rig import load_canonical
 from soma_core.rig.landmarks import canonical_landmarks
 
 TIP_M = 0.012  # a tip is the vertex furthest from the wrist, on a coarse mesh another one
 SLID_M = 0.04  # of a face, off a forehead that stays
+SOLE_M = 0.012
 FEW_FACES = 2000
 SIDES, LONG = ("Left", "Right"), ("Index", "Middle", "Ring")
 AWAY_M = 0.03  # what a rough fit may be off at wrists and insteps
@@ -132,6 +135,19 @@ def test_less_is_asked_of_digits_on_a_mesh_of_few_faces(guide, halved) -> None:
     assert all(any(text.startswith(f"{side}{name}: ") for text in said) for side in SIDES for name in LONG)
 
 
+def test_what_lies_over_holes_is_no_fault_until_a_part_is_gone(guide) -> None:
+    mesh, rig = load_canonical("mid")
+    body, faces = mesh.vertices, mesh.triangles.astype(np.int64)
+    sole = body[:, 1] < body[:, 1].min() + SOLE_M
+    hand = np.char.startswith(np.array(rig.joint_names)[rig.weights.toarray().argmax(1)], "LeftHand")
+    for gone, said in ((sole, ()), (hand, ("LeftHand", "LeftThumb"))):
+        skin = find_skin(body, faces[~gone[faces].any(1)])
+        assert not skin.masked
+        assert skin.notes[-1] == "has holes; skin is drawn over them"
+        frame = Frame(unit="m", up="+y", forward="+z", centre=(0.0, 0.0, 0.0))
+        assert list(lost(body, skin.surface(frame), rig))[:2] == list(said)
+
+
 def test_a_face_that_slid_is_found_out(guide) -> None:
     mesh, rig = load_canonical("mid")
     filled = np.zeros(mesh.vertex_count, bool)
@@ -144,10 +160,19 @@ def test_a_face_that_slid_is_found_out(guide) -> None:
 
 
 @pytest.mark.parametrize(
-    ("count", "told", "refused"), [(4, (), True), (4, ("LeftHand",), False), (2, (), False)]
+    ("count", "told", "refused"),
+    [
+        (4, (), True),
+        (4, ("LeftHand",), False),
+        (2, (), False),
+        (None, (), True),
+        (None, ("LeftHand",), False),
+    ],
 )
 def test_fingers_that_cannot_be_told_apart_are_refused_by_name(count, told, refused) -> None:
     counts = dict.fromkeys(LIMBS, 5) | {"LeftHand": count}
     said = faults({"head": Share(wrap=1.0, native=1.0)}, {}, counts, told=told)
     text = f"LeftHand: {count} fingers stand out of the mesh, not 5, so that none can be told from another"
+    if count is None:
+        text = "LeftHand: it touches another part of the mesh, so that no finger can be told"
     assert said == ((text,) if refused else ())

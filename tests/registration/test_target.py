@@ -57,7 +57,7 @@ def test_masked_vertices_are_left_out() -> None:
     skin = find_skin(vertices, triangles, masked=hat)
     assert skin.vertices[:, 1].max() <= 0.9
     assert skin.notes == (f"{len(hat)} masked vertices left out",)
-    assert skin.rim is not None
+    assert skin.masked
     assert skin.rim.sum() == 80  # the ring of vertices below the hat
     height = skin.vertices[skin.rim, 1]
     assert height.min() == height.max() == skin.vertices[:, 1].max()
