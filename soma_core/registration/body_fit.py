@@ -40,6 +40,9 @@ _ASTRAY = 6.5e-3
 """Mean distance [m] of the parts of a hand's fingers from where they belong beyond which it is placed anew;
 open hands have 4 to 6, relaxed ones 7."""
 
+_NEARER = 0.5
+"""Share of that distance that may be left; else the hand stays as it was."""
+
 _ROUND = 5
 """Vertices of a part of a finger from which on their mean is its middle; a mesh of 2,000 faces has one."""
 
@@ -143,17 +146,19 @@ def place_hands(model: BodyModel, pose: BodyPose, digits: Digits) -> BodyPose:
         digits: fingers of the surface.
     """
     for limb, middles in digits.middles.items():
-        known = limb.endswith("Hand") and digits.least(limb) >= _ROUND
-        if known and np.linalg.norm(_apart(model, pose, limb, middles), axis=1).mean() > _ASTRAY:
-            pose = _placed_hand(model, pose, limb, middles)
+        if not limb.endswith("Hand") or digits.least(limb) < _ROUND:
+            continue
+        before = _apart(model, pose, limb, middles)
+        placed = _placed_hand(model, pose, limb, middles) if before > _ASTRAY else pose
+        pose = placed if _apart(model, placed, limb, middles) < _NEARER * before else pose
     return pose
 
 
-def _apart(model: BodyModel, pose: BodyPose, limb: str, middles: np.ndarray) -> np.ndarray:
-    """From the parts of a hand's fingers to where they belong, (5 x 4, 3) [m]."""
+def _apart(model: BodyModel, pose: BodyPose, limb: str, middles: np.ndarray) -> float:
+    """Mean distance [m] of the parts of a hand's fingers from where they belong."""
     vertices, _ = model.evaluate(pose)
     ids, shares = digit_guide().rings(limb, len(vertices))
-    return middles - np.einsum("mk,mkc->mc", shares, vertices[ids])
+    return float(np.linalg.norm(middles - np.einsum("mk,mkc->mc", shares, vertices[ids]), axis=1).mean())
 
 
 def _placed_hand(model: BodyModel, start: BodyPose, limb: str, middles: np.ndarray) -> BodyPose:
