@@ -13,8 +13,8 @@ from scipy.spatial.transform import Rotation
 from soma_core import SomaLayer, load_canonical
 from soma_core.errors import InputError
 from soma_core.io import read_motion, write_motion
-from soma_core.motion import ConvertOptions, convert_file, load_clip
-from soma_core.native import NativeTransfer
+from soma_core.motion import ConvertOptions, back, convert_file, load_clip
+from soma_core.native import NativeFit, NativeTransfer
 from soma_core.options import FrameRange
 
 WIDTHS = {"smplx": 10, "smplh": 16}
@@ -44,7 +44,21 @@ def data_folder(tmp_path_factory):
             arrays = smpl_arrays(name, width=width)
             module.soma_convert(write_npz(root / "official" / name / file, arrays), None)
             write_smpl_wrap(root, name)
+        patch.setattr(back, "NativeFit", shared_fit())
         yield root
+
+
+def shared_fit():
+    """Builds a fit of each kind once for all conversions here, as one conversion does for its files."""
+    made = {}
+
+    def build(name, **kind):
+        key = name, repr(kind)
+        if key not in made:
+            made[key] = NativeFit(name, **kind)
+        return made[key]
+
+    return build
 
 
 @pytest.fixture(scope="module")
