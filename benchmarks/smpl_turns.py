@@ -1,7 +1,9 @@
 """Converted motions of SMPL stand-ins against the turns of their files: ``python benchmarks/smpl_turns.py``.
 
 The stand-ins' skin is this rig's own under plain skinning, with pose blend shapes that are noise: see
-``tests/standins``. Motions are the shipped one and those given as arguments, such as kimodo's.
+``tests/standins``. Motions are the shipped one and those given as arguments, such as kimodo's. With
+``--back`` motions of this skeleton go to each model and back again: vertices, rotations, and how smoothly the
+model's own joints turn.
 """
 
 from __future__ import annotations
@@ -10,13 +12,16 @@ import argparse
 import os
 import sys
 import tempfile
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import torch
 from scipy.spatial.transform import Rotation
 
 sys.path.insert(0, str(Path(__file__).parent.parent))
 
+from soma_core import Motion, SomaLayer, read_amass, write_motion
 from soma_core.choices import Skinning
 from soma_core.io.joint_order import USER_JOINTS
 from soma_core.io.skeleton_motion import soma_skeleton
@@ -34,15 +39,29 @@ _FRAMES, _STEP, _FAR = 24, 3, 30.0
 _BODY = ("Arm", "ForeArm", "Hand", "Leg", "Shin", "Foot", "Shoulder")
 
 
-def _model(root: Path, noise: float) -> None:
-    """A stand-in of SMPL-H whose blend shapes are that many times as large."""
-    from soma_backend_smpl import smplh
+_BACK = (("smplx", 20, 10), ("smplx", 400, 16), ("smplh", 16, 16))
+"""Models of the way there and back: shape directions of the file, and betas of the body."""
+
+_SELECTED, _APART = 16, 5
+_GROUPS = {
+    "trunk": ("Hips", "Spine1", "Spine2", "Chest"), "neck": ("Neck1", "Neck2", "Head"), "jaw": ("Jaw",),
+    "shoulders": ("Shoulder",), "upper arms": ("Arm",), "forearms": ("ForeArm",), "hands": ("Hand",),
+    "fingers": tuple(f"Hand{finger}{k}" for finger in ("Thumb", "Index", "Middle", "Ring", "Pinky")
+                     for k in (1, 2, 3, 4) if (finger, k) != ("Thumb", 4)),
+    "thighs": ("Leg",), "shins": ("Shin",), "feet": ("Foot", "ToeBase"),
+}  # fmt: skip
+
+
+def _model(root: Path, noise: float, name: str = "smplh", width: int = 16) -> None:
+    """A stand-in whose blend shapes are that many times as large."""
+    from soma_backend_smpl import smplh, smplx
 
     os.environ |= {"SOMA_DATA_DIR": str(root), "SOMA_CACHE_DIR": str(root / "cache")}
-    arrays = smpl_files.smpl_arrays("smplh", width=16)
+    arrays = smpl_files.smpl_arrays(name, width=width)
     arrays["posedirs"] = noise * arrays["posedirs"]
-    smplh.soma_convert(smpl_files.write_npz(root / "official/neutral/model.npz", arrays), None)
-    smpl_files.write_smpl_wrap(root, "smplh")
+    module, file = (smplx, "SMPLX_NEUTRAL.npz") if name == "smplx" else (smplh, "neutral/model.npz")
+    module.soma_convert(smpl_files.write_npz(root / "official" / file, arrays), None)
+    smpl_files.write_smpl_wrap(root, name)
 
 
 def _write(path: Path, turns: np.ndarray, places: np.ndarray, seed: int, fps: float) -> None:
@@ -81,11 +100,97 @@ def _row(found: list[tuple[np.ndarray, np.ndarray, float]]) -> str:
     )
 
 
+def _selected(file: Path | None, seed: int) -> Motion:
+    """Frames of a motion, a few apart, from a place that the seed draws."""
+    clip = load_clip(file)
+    start = np.random.default_rng(seed).integers(max(clip.frame_count - _SELECTED * _APART, 1))
+    part = clip.cut(slice(int(start), int(start) + _SELECTED * _APART, _APART))
+    return replace(part, fps=clip.fps / _APART)
+
+
+def _steps(local: np.ndarray) -> np.ndarray:
+    """Degrees (frames - 1, J) that local rotations turn by from frame to frame."""
+    return _degrees(np.swapaxes(local[:-1], -1, -2) @ local[1:])
+
+
+def _leaps(name: str, file: Path, true: np.ndarray) -> np.ndarray:
+    """Degrees by which joints of a file turn further from frame to frame than they do here."""
+    family, found = smpl_files.FAMILIES[name], read_amass(file).rotations
+    own = true[:, [USER_JOINTS.index(smpl_files._canonical_name(joint)) for joint in family.joint_names]]
+    local = np.swapaxes(own[:, np.maximum(family.parents, 0)], -1, -2) @ own
+    local[:, 0] = own[:, 0]
+    there = Rotation.from_rotvec(found.reshape(-1, 3)).as_matrix().reshape(*found.shape, 3)
+    told = [number for number, joint in enumerate(family.joint_names) if "eye" not in joint]
+    return (_steps(there) - _steps(local))[:, told]
+
+
+def _there_and_back(root: Path, name: str, motion: Motion) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Errors (frames, v) [mm] of the skin, (frames, 77) of world turns [degrees], and leaps on the way."""
+    write_motion(motion, root / "motion.npz")
+    convert_file(root / "motion.npz", root / "there", options=ConvertOptions(to=name, up="y"))
+    done = convert_file(root / "there/motion.npz", root / "back", options=ConvertOptions(up="y"))
+    layer, rig = SomaLayer(name), load_canonical("mid")[1]
+    body = layer.identity(motion.identity["params"])
+    with torch.no_grad():
+        skins = [
+            layer.pose(body, torch.as_tensor(one.rotations), torch.as_tensor(one.translation)).vertices
+            for one in (motion, done.motion())
+        ]
+    seen = np.setdiff1d(np.arange(layer.mesh.vertex_count), layer.mesh.face_interior)
+    true, turns = (soma_skeleton(one, rig).turns() for one in (motion, done.motion()))
+    return (
+        1e3 * (skins[1] - skins[0]).norm(dim=-1)[:, seen].numpy(),
+        _degrees(np.swapaxes(true, -1, -2) @ turns),
+        _leaps(name, root / "there/motion.npz", true),
+    )
+
+
+def _print_back(files: list[Path | None], seeds: int) -> None:
+    """A row for each model and motion, and the angles of all motions of a model."""
+    for name, width, count in _BACK:
+        angles, leaps, frames = [], [], []
+        for number, file in enumerate(files):
+            for seed in range(seeds):
+                betas = np.random.default_rng(100 * number + seed).normal(size=count).tolist()
+                identity = {"backend": name, "params": {"betas": betas}}
+                with tempfile.TemporaryDirectory() as where:
+                    _model(Path(where), 1.0, name, width)
+                    motion = replace(_selected(file, seed), identity=identity)
+                    skin, turned, leapt = _there_and_back(Path(where), name, motion)
+                angles.append(turned)
+                leaps.append(leapt)
+                frames.append(skin.mean(1))
+                source = "shipped" if file is None else file.stem
+                sys.stdout.write(
+                    f"| {name}, {count} betas | {source} | {seed} | {skin.mean():.2f} | "
+                    f"{skin.mean(1).max():.2f} |\n"
+                )
+        every, leapt = np.concatenate(angles), np.concatenate([each.ravel() for each in leaps])
+        sys.stdout.write(f"{name}: {np.concatenate(frames).mean():.2f} mm; degrees, mean and P95: ")
+        told = []
+        for group, parts in _GROUPS.items():
+            joints = (
+                [USER_JOINTS.index(part) for part in parts] if parts[0] in USER_JOINTS else _joints(*parts)
+            )
+            found = every[:, joints]
+            told.append(f"{group} {found.mean():.1f} {np.percentile(found, 95):.1f}")
+        sys.stdout.write(
+            f"{', '.join(told)}; leaps of its joints beyond the true ones, P95 and largest: "
+            f"{np.percentile(leapt, 95):.1f} {leapt.max():.1f}\n"
+        )
+
+
 def main() -> None:
     """Print a row for each fit."""
     options = argparse.ArgumentParser(description=__doc__)
     options.add_argument("motions", type=Path, nargs="*")
-    files: list[Path | None] = [None, *options.parse_args().motions]
+    options.add_argument("--back", action="store_true", help="to each model and back again")
+    options.add_argument("--seeds", type=int, default=2, help="selections of frames and bodies, with --back")
+    given = options.parse_args()
+    files: list[Path | None] = [None, *given.motions]
+    if given.back:
+        _print_back(files, given.seeds)
+        return
     rows: dict[str, list[tuple[np.ndarray, np.ndarray, float]]] = {name: [] for name in _FITS}
     rig = load_canonical("mid")[1]
     for seed, noise in enumerate(_NOISES):

@@ -20,10 +20,12 @@ __all__ = [
     "JointTerms",
     "PosePriors",
     "TwistDoubt",
+    "expected_firmness",
     "expected_terms",
     "hinge_rotation",
     "joint_terms",
     "neighbour_mean",
+    "part_of_terms",
     "twist_doubt",
     "with_references",
 ]
@@ -53,10 +55,13 @@ and how much a twist is in doubt [1/rad]. Elbows and knees, of whose twist skin 
 fingers."""
 
 
-_EXPECTED = {"Hips": 0.0, "ForeArm": 4e-3, "Shin": 4e-3}
-_EXPECTED_FINGER, _EXPECTED_PALM, _EXPECTED_OTHER = 2e-4, 4e-4, 1e-3
-"""How firmly joints are held near turns that are expected of them [m/rad]: elbows and knees above what the
-share of a limb's twist changes of skin, all of them far below what skin tells of a bend."""
+_EXPECTED = {
+    "Hips": 0.0, "Arm": 3e-3, "ForeArm": 4e-3, "Hand": 4e-3, "Leg": 2e-3, "Shin": 2e-3, "HandThumb1": 1e-3,
+}  # fmt: skip
+_EXPECTED_FINGER, _EXPECTED_PALM, _EXPECTED_OTHER = 5e-4, 2.5e-3, 1e-3
+"""How firmly joints are held near turns that are expected of them [m/rad]: limbs above what the share of
+their twist changes of skin, all of them far below what skin tells of a bend. Palms, which other rigs do
+not have, would turn against the hand for a tenth of a millimetre."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -315,19 +320,26 @@ def with_references(
     )
 
 
+def part_of_terms(terms: JointTerms | None, rows: slice) -> JointTerms | None:
+    """The terms of some frames."""
+    return terms if terms is None else replace(terms, reference=terms.reference[rows])
+
+
 def expected_terms(
     terms: JointTerms | None, expected: Tensor, names: Sequence[str], factor: float
 ) -> JointTerms:
     """Add a faint pull to expected rotations (F, n, 3, 3) of the variable joints `names`."""
-    return with_references(terms, expected, [factor * _expected(name) for name in names])
+    return with_references(terms, expected, [factor * expected_firmness(name) for name in names])
 
 
-def _expected(name: str) -> float:
-    """Strength [m/rad] for a joint."""
+def expected_firmness(name: str) -> float:
+    """How firmly a joint is held near an expected turn [m/rad]."""
     part = name.removeprefix("Left").removeprefix("Right")
+    if part in _EXPECTED:
+        return _EXPECTED[part]
     if part.startswith("Hand") and part[-1].isdigit():
-        return _EXPECTED_PALM if part[-1] == "1" and "Thumb" not in part else _EXPECTED_FINGER
-    return _EXPECTED.get(part, _EXPECTED_OTHER)
+        return _EXPECTED_PALM if part[-1] == "1" else _EXPECTED_FINGER
+    return _EXPECTED_OTHER
 
 
 def neighbour_mean(rotations: Tensor, valid: Tensor) -> Tensor:

@@ -139,7 +139,7 @@ class BackConverter:
         return SmplTarget(
             fit=fit, errors=NativeErrors(fit.transfer, kind["lod"]), model=name, gender=gender,
             up=chosen.upward or "+z", params=params, width=chosen.num_betas,
-            layout=str(chosen.layout or SmplLayout.amass),
+            layout=str(chosen.layout or SmplLayout.amass), expected=chosen.inversion.priors.expected,
         )  # fmt: skip
 
     def _model_target(
@@ -199,7 +199,7 @@ def _convert_missing(body: Played, target: NativeTarget, kept: FittedChunks) -> 
     """Pose and convert the chunks that are not there yet."""
     missing, total = kept.missing(), len(kept.ranges)
     for number in progress(missing, label="chunk", total=total, done=total - len(missing), after=5.0):
-        kept.save(number, target.arrays(body.posed(slice(*kept.ranges[number]))))
+        kept.save(number, target.arrays(body, slice(*kept.ranges[number])))
 
 
 def _usual_result(options: ConvertOptions) -> str:

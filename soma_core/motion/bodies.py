@@ -4,17 +4,15 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
-from soma_core.choices import BoneMatch
 from soma_core.errors import AssetError, InputError
 from soma_core.io.amass import SmplMotion
 from soma_core.io.sam3d import Sam3dFrames, read_sam3d
-from soma_core.io.smpl_skeleton import smpl_skeleton
 from soma_core.io.vertex_files import open_vertex_sequence
 from soma_core.motion.files import read_model_motion
 from soma_core.motion.models import (
@@ -27,11 +25,10 @@ from soma_core.motion.models import (
 from soma_core.motion.options import ConvertOptions, FitOptions, InvertOptions
 from soma_core.motion.posed_input import PosedInput
 from soma_core.motion.questions import of_params, of_rate, of_smpl
-from soma_core.motion.retargeting import retarget
 from soma_core.motion.smpl_input import chosen_reading, smpl_choices, smpl_motion
+from soma_core.motion.smpl_turns import turns_from_smpl
 from soma_core.plugin.errors import BackendError, BrokenBackendError
 from soma_core.plugin.registry import default_registry
-from soma_core.rig import load_canonical
 
 if TYPE_CHECKING:
     from soma_core.plugin.spec import BackendSpec
@@ -175,15 +172,8 @@ def _smpl_body(path: Path, options: ConvertOptions, backends: FitBackends) -> Sh
         licence=f"that of {path.name}; body model: {backend.layer.spec.licence}",
         doubts=tuple(of_smpl(motion) + of_params(backend.layer.spec, params, setting="")),
         expression=motion.expression,
-        expected=_expected(motion, pose["rotations"]),
+        expected=turns_from_smpl(motion, pose["rotations"]),
     )
-
-
-def _expected(motion: SmplMotion, rotations: np.ndarray) -> np.ndarray:
-    """About how joints turn (frames, 77, 3, 3) against their parents: carried over, the root left upright."""
-    rotations = np.concatenate([np.zeros_like(rotations[:, :1]), rotations[:, 1:]], axis=1)
-    upright = replace(motion, rotations=rotations, up="+y", camera_turns=None)
-    return retarget(smpl_skeleton(upright, load_canonical("mid")[1]), match=BoneMatch.limbs).motion.rotations
 
 
 def _model_pose(

@@ -23,6 +23,7 @@ from soma_core.motion.files import ResultFiles
 from soma_core.motion.native_errors import NativeErrors
 from soma_core.motion.played import Played
 from soma_core.motion.posed_input import world_axes
+from soma_core.motion.smpl_turns import turns_to_smpl
 from soma_core.motion.writers import WRITERS
 from soma_core.native import NativeFit, NativeTransfer, ParameterFit
 from soma_core.native.motion import NativeMotion
@@ -60,8 +61,8 @@ class NativeTarget(Protocol):
         """What is written, and where."""
         ...
 
-    def arrays(self, vertices: Tensor) -> dict[str, np.ndarray]:
-        """What is kept of a chunk of frames (F, v, 3) [m]."""
+    def arrays(self, body: Played, frames: slice) -> dict[str, np.ndarray]:
+        """What is kept of a chunk of frames."""
         ...
 
     def write(self, chunks: FittedChunks, files: ResultFiles, *, fps: float, source: str) -> dict[str, Any]:
@@ -91,9 +92,9 @@ class VertexTarget:
         """A file or a folder for each product."""
         return {str(product): files.product(product) for product in self.products}
 
-    def arrays(self, vertices: Tensor) -> dict[str, np.ndarray]:
+    def arrays(self, body: Played, frames: slice) -> dict[str, np.ndarray]:
         """The vertices."""
-        return {"vertices": self.transfer(vertices).float().cpu().numpy()}
+        return {"vertices": self.transfer(body.posed(frames)).float().cpu().numpy()}
 
     def write(self, chunks: FittedChunks, files: ResultFiles, *, fps: float, source: str) -> dict[str, Any]:
         """Write the products, for which the mesh is streamed chunk by chunk."""
@@ -122,6 +123,7 @@ class SmplTarget:
         width: shape coefficients that are written; None: those of the body, or of the model.
         layout: ``amass`` or ``smplx``, the names of the keys.
         expression: (frames, k) coefficients of the face that the motion keeps of its own SMPL-X.
+        expected: factor on how firmly joints are held near the motion's own turns; 0 for not at all.
     """
 
     fit: NativeFit
@@ -133,6 +135,7 @@ class SmplTarget:
     width: int | None = None
     layout: str = "amass"
     expression: np.ndarray | None = None
+    expected: float = 1.0
 
     def __post_init__(self) -> None:
         """Leave out coefficients that are not to be written: poses then make up for what they can."""
@@ -155,18 +158,23 @@ class SmplTarget:
         params = "found" if self.params is None else dict(self.params)
         return {
             "to": self.model, "gender": self.gender, "params": params, "up": self.up,
-            "num_betas": self.width, "to_layout": self.layout,
+            "num_betas": self.width, "to_layout": self.layout, "expected": self.expected,
         }  # fmt: skip
 
     def results(self, files: ResultFiles) -> dict[str, Path]:
         """One file of poses."""
         return {"npz": files.motion}
 
-    def arrays(self, vertices: Tensor) -> dict[str, np.ndarray]:
+    def arrays(self, body: Played, frames: slice) -> dict[str, np.ndarray]:
         """Parameters of the frames, and statistics of the error."""
+        vertices = body.posed(frames)
         if self.up != "+y":  # the fit does not care which way a body is turned
             vertices = vertices @ torch.as_tensor(world_axes(self.up)).to(vertices)
-        found = self.fit(vertices, params=self.params)
+        near: dict[str, Tensor] = {}
+        if self.expected:
+            turns, firmness = turns_to_smpl(body.motion.cut(frames), self.model)
+            near = {"expected": torch.as_tensor(turns), "firmness": self.expected * torch.as_tensor(firmness)}
+        found = self.fit(vertices, params=self.params, weights=self.fit.transfer.shares, **near)
         return {
             "rotations": found.rotations.float().cpu().numpy(),
             "translation": found.translation.float().cpu().numpy(),
@@ -226,9 +234,9 @@ class ParameterTarget:
         """Parameters of the model's body that comes nearest to the T-pose."""
         return _found_by_t_pose(self.fit, body)
 
-    def arrays(self, vertices: Tensor) -> dict[str, np.ndarray]:
+    def arrays(self, body: Played, frames: slice) -> dict[str, np.ndarray]:
         """Parameters of the frames, and statistics of the error."""
-        found = self.fit(vertices, params=self.params)
+        found = self.fit(body.posed(frames), params=self.params)
         own = self.fit.generator.own_arrays(found.params, found.parameters)
         return {
             **{_OWN + name: value.float().cpu().numpy() for name, value in own.items()},
@@ -283,9 +291,9 @@ class ModelTarget:
             return _found_by_frames(self.fit, body)
         return _found_by_t_pose(self.fit, body)
 
-    def arrays(self, vertices: Tensor) -> dict[str, np.ndarray]:
+    def arrays(self, body: Played, frames: slice) -> dict[str, np.ndarray]:
         """Poses of the frames, and statistics of the error."""
-        found = self.fit(vertices, params=self.params)
+        found = self.fit(body.posed(frames), params=self.params)
         names = ("rotations", "translation") if isinstance(self.fit, NativeFit) else ("parameters",)
         poses = {_OWN + name: getattr(found, name).float().cpu().numpy() for name in names}
         return {**poses, **_told(found, self.errors)}

@@ -18,6 +18,7 @@ from soma_core.geometry.rotations import matrix_to_axis_angle
 from soma_core.inversion._inputs import check_weights, refuse_transforms
 from soma_core.inversion.fit import Topology
 from soma_core.inversion.implicit import attach_gradient
+from soma_core.inversion.priors import JointTerms, part_of_terms, with_references
 from soma_core.layer import Kernels
 from soma_core.native.model import NativeBody, NativeRig
 from soma_core.native.motion import NativeMotion
@@ -129,6 +130,8 @@ class NativeFit(Derived):
         *,
         params: Mapping[str, Any] | None = None,
         weights: Tensor | None = None,
+        expected: Tensor | None = None,
+        firmness: Tensor | None = None,
     ) -> NativeMotion:
         """Fit every frame on its own, one body for all.
 
@@ -138,6 +141,10 @@ class NativeFit(Derived):
             params: the body's parameters, one sample; what is left out has its default. See
                 :meth:`fit_params` for those of an unknown body.
             weights: (n,) of native vertices, default 1; those without a counterpart never count.
+            expected: (F, J, 3, 3) local rotations that joints are held near, as another rig turned them: skin
+                does not tell all of them.
+            firmness: (J,) how firmly [m/rad]; a joint that is off by an angle a costs as much as a root mean
+                square vertex error of ``firmness a``.
 
         Returns:
             Rotations, translation and vertices carry gradients by `vertices` (the implicit derivative of the
@@ -151,7 +158,9 @@ class NativeFit(Derived):
         target = self._native(vertices)
         with torch.no_grad():
             fit = self._prepared(self._one_body(params), self._weights(weights))
-        return _joined([self._fit(fit, part) for part in target.split(_CHUNK)])
+            terms = self._terms(expected, firmness, len(target))
+        chunks = [slice(start, start + _CHUNK) for start in range(0, len(target), _CHUNK) or (0,)]
+        return _joined([self._fit(fit, target[chunk], part_of_terms(terms, chunk)) for chunk in chunks])
 
     if TYPE_CHECKING:  # torch says that a module returns anything
         __call__ = forward
@@ -274,6 +283,22 @@ class NativeFit(Derived):
         counted = self.transfer.covered.to(self.dtype)
         return counted if weights is None else counted * check_weights(weights, counted, 0)[0]
 
+    def _terms(self, expected: Tensor | None, firmness: Tensor | None, frames: int) -> JointTerms | None:
+        """The pull of joints to expected rotations."""
+        if expected is None:
+            return None
+        joints = len(self.joint_names)
+        if tuple(expected.shape) != (frames, joints, 3, 3) or firmness is None or len(firmness) != joints:
+            told = "no firmness" if firmness is None else f"firmness {tuple(firmness.shape)}"
+            raise InputError(
+                "expected", got=f"{tuple(expected.shape)} and {told}",
+                expected=f"({frames}, {joints}, 3, 3) and firmness ({joints},)",
+                fix="Pass both, of all joints.",
+            )  # fmt: skip
+        variables = self.rig.solver.variables - 1
+        reference = expected.to(self.device, self.dtype)[:, variables]
+        return with_references(None, reference, firmness.to(self.device)[variables].tolist())
+
     def _model(self, params: Mapping[str, Tensor]) -> SkinnedModel:
         with self._isolated():
             return self._generator.skinning(params)
@@ -288,18 +313,18 @@ class NativeFit(Derived):
             self.rig, self._body(params), weights, iterations=self.iterations, tolerance=self.tolerance
         )
 
-    def _fit(self, fit: PoseFit, target: Tensor) -> NativeMotion:
+    def _fit(self, fit: PoseFit, target: Tensor, terms: JointTerms | None) -> NativeMotion:
         """Fit a chunk of frames (F, n, 3) [m]."""
         near, origin, known = _finite(fit.body, target, fit.weights)
         valid = known.any(1)
         with torch.no_grad():
-            pose = fit(near.detach())
+            pose = fit(near.detach(), terms)
         rotations, pelvis = pose.relative[:, 1:], pose.translation
         if torch.is_grad_enabled() and near.requires_grad:
             target = near.detach()
             rotations, pelvis = attach_gradient(
-                near, rotations, pelvis, model=self.rig, problem=lambda rows: fit.problem(target[rows]),
-                valid=valid,
+                near, rotations, pelvis, model=self.rig, valid=valid,
+                problem=lambda rows: fit.problem(target[rows], part_of_terms(terms, rows)),
             )  # fmt: skip
         posed = self.rig.posed(fit.body.identity, rotations, pelvis)
         error = torch.linalg.vector_norm(posed.detach() - near.detach(), dim=-1)

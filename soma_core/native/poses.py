@@ -7,6 +7,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
+from soma_core.inversion.priors import JointTerms
 from soma_core.inversion.problem import Pose, Problem
 from soma_core.inversion.refine import Refinement
 from soma_core.inversion.start import best_translation
@@ -40,18 +41,18 @@ class PoseFit:
         self._iterations, self._tolerance = iterations, tolerance
         self.rest = rig.rest(body.identity, weights[None])
 
-    def __call__(self, target: Tensor) -> Pose:
-        """Poses for finite targets (F, n, 3) [m]; translations are places of the root joint."""
-        problem = self.problem(target)
+    def __call__(self, target: Tensor, terms: JointTerms | None = None) -> Pose:
+        """Poses for finite targets (F, n, 3) [m] under terms; translations are places of the root joint."""
+        problem = self.problem(target, terms)
         pose = self._skinned(problem)
         if self.rig.blended and self._iterations:
             pose = replace(pose, accepted=torch.zeros_like(pose.accepted))
             pose = Refinement(self.rig, problem)(pose, iterations=self._iterations, tolerance=self._tolerance)
         return replace(pose, translation=pose.translation + problem.origin)
 
-    def problem(self, target: Tensor) -> Problem:
-        """The problem of targets (F, n, 3) [m]."""
-        return self.rig.problem(target, self.body.identity, self.weights, self.rest)
+    def problem(self, target: Tensor, terms: JointTerms | None = None) -> Problem:
+        """The problem of targets (F, n, 3) [m] under terms."""
+        return replace(self.rig.problem(target, self.body.identity, self.weights, self.rest), terms=terms)
 
     def posed(self, pose: Pose) -> Tensor:
         """Vertices (F, n, 3) [m] of poses."""
@@ -65,4 +66,7 @@ class PoseFit:
         turns, places = rig.walk(pose, rest)
         shift = best_translation(problem.target, rest, turns[:, joints], places[:, joints])
         pose = replace(pose, translation=shift)
-        return rig.solver(problem.target, rest, pose, iterations=_SKIN_ITERATIONS, tolerance=self._tolerance)
+        return rig.solver(
+            problem.target, rest, pose, iterations=_SKIN_ITERATIONS, tolerance=self._tolerance,
+            terms=problem.terms,
+        )  # fmt: skip

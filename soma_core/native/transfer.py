@@ -34,6 +34,9 @@ _CODE_VERSION = "1"
 _NEAR = 0.003
 """Distance to the wrap, relative to the native bounding diagonal, above which a vertex lies elsewhere."""
 
+_LEAST_SHARE = 0.01
+"""Of a vertex between canonical ones, whose error is to be told too."""
+
 _COUNTERPART = 0.5
 """A separate piece of which less has a counterpart, such as an eyeball behind its lids, has none."""
 
@@ -55,6 +58,8 @@ class NativeTransfer(torch.nn.Module):
         count: number n of native vertices.
         triangles: native vertex ids (t, 3), int64.
         covered: (n,) bool, native vertices with a counterpart on the wrap.
+        shares: (n,) how many canonical vertices each of these stands for: errors weighed by it are those of
+            the canonical mesh.
 
     Raises:
         BackendError: the backend is not installed, or its wrap pair is missing or unusable.
@@ -98,7 +103,9 @@ class NativeTransfer(torch.nn.Module):
         self.corners = keep(back.corners)
         self.height = keep(back.coordinates[:, 2])
         self.triangles = keep(forward.native_triangles)
-        self.covered = keep(_covered(back, forward.native_triangles, filled_vertices(spec, mesh), mesh))
+        apart = np.union1d(filled_vertices(spec, mesh), mesh.face_interior)
+        covered = _covered(back, forward.native_triangles, apart)
+        self.covered, self.shares = keep(covered), keep(_shares(forward, covered, apart, mesh))
         self.frame = keep(frame)
 
     def forward(self, vertices: Tensor) -> Tensor:
@@ -143,13 +150,21 @@ def _reverse(forward: Correspondence, mesh: CanonicalMesh) -> Correspondence:
     )
 
 
-def _covered(
-    back: Correspondence, triangles: np.ndarray, filled: np.ndarray, mesh: CanonicalMesh
+def _shares(
+    forward: Correspondence, covered: np.ndarray, apart: np.ndarray, mesh: CanonicalMesh
 ) -> np.ndarray:
-    """(n,) native vertices that lie on the wrap, outside what is filled and the face interior."""
+    """(n,) canonical vertices outside `apart` that each native vertex carries; zero without a counterpart."""
+    counted = np.ones(mesh.vertex_count)
+    counted[apart] = 0
+    carried = affine_matrix(forward)[mesh.mid_ids].T @ counted
+    return np.where(covered, np.maximum(carried, _LEAST_SHARE), 0)
+
+
+def _covered(back: Correspondence, triangles: np.ndarray, apart: np.ndarray) -> np.ndarray:
+    """(n,) native vertices that lie on the wrap, outside `apart`, what is filled and the face interior."""
     diagonal = np.linalg.norm(np.ptp(back.wrap_vertices, axis=0))
-    apart = np.isin(back.corners, np.union1d(filled, mesh.face_interior)).all(1)
-    covered = (back.distances < _NEAR * diagonal) & ~apart
+    inner = np.isin(back.corners, apart).all(1)
+    covered = (back.distances < _NEAR * diagonal) & ~inner
     count = len(covered)
     ends = np.concatenate([triangles[:, :2], triangles[:, 1:]])
     edges = coo_array((np.ones(len(ends), bool), tuple(ends.T)), shape=(count, count))

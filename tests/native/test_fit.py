@@ -9,6 +9,7 @@ import pytest
 import torch
 
 from soma_core.errors import InputError
+from soma_core.geometry.rotations import axis_angle_to_matrix, matrix_to_axis_angle
 from soma_core.inversion import PoseInversion
 from soma_core.native import NativeFit
 from soma_core.plugin.registry import default_registry
@@ -108,6 +109,33 @@ def test_weights_leave_vertices_out(fit, vertices, motion):
     assert bool(found.vertex_error[0, weights == 0].isnan().all())
     left, before = (one.vertex_error[0, weights > 0].nan_to_num().square().sum() for one in (found, motion))
     assert float(left) < float(before)
+
+
+def test_joints_are_held_near_what_is_expected(fit, vertices, motion):
+    wrist = motion.joint_names.index("left_wrist")
+    turns = axis_angle_to_matrix(motion.rotations)
+    turns[:, wrist] = turns[:, wrist] @ axis_angle_to_matrix(torch.tensor([0.3, 0.0, 0.0]))
+    held = torch.zeros(len(motion.joint_names))
+    left = []
+    for firmness in (0.0, 1e-2, 1.0):
+        held[wrist] = firmness
+        found = fit(vertices, params=motion.params, expected=turns, firmness=held)
+        apart = turns[:, wrist].transpose(-1, -2) @ axis_angle_to_matrix(found.rotations[:, wrist])
+        left.append(float(matrix_to_axis_angle(apart).norm(dim=-1).mean()))
+        if not firmness:
+            torch.testing.assert_close(found.residual, motion.residual, atol=0.1 * SAME, rtol=0)
+    assert left[0] == pytest.approx(0.3, abs=1e-2)
+    assert left[0] > left[1] > left[2]
+    assert left[2] < 0.02
+    parts = fit(vertices[2:], params=motion.params, expected=turns[2:], firmness=held)
+    torch.testing.assert_close(parts.residual, found.residual[2:], atol=0.1 * SAME, rtol=0)
+
+
+@pytest.mark.parametrize("firmness", [None, torch.zeros(3)])
+def test_what_is_expected_is_of_all_joints(fit, vertices, firmness):
+    turns = torch.eye(3).expand(len(vertices), len(fit.joint_names), 3, 3)
+    with pytest.raises(InputError, match=r"expected: got .*expected \(4, 55, 3, 3\) and firmness \(55,\)"):
+        fit(vertices, expected=turns, firmness=firmness)
 
 
 def test_no_frames_are_none(fit, vertices):

@@ -83,6 +83,14 @@ def test_what_the_wrap_does_not_reach_is_said(fit):
     assert 0.9 < float(covered.float().mean()) < 1
 
 
+def test_shares_are_the_canonical_vertices_that_each_stands_for(fit, layer):
+    shares, covered = fit.transfer.shares, fit.transfer.covered
+    assert bool((shares[covered] > 0).all())
+    assert not shares[~covered].any()
+    seen = layer.mesh.vertex_count - len(layer.mesh.face_interior)
+    assert 0.9 < float(shares.sum()) / seen < 1.05
+
+
 def test_refusals(toy, toy_wrap, tmp_path, monkeypatch):
     with pytest.raises(InputError, match="backend: got soma, expected a backend with a topology of its own"):
         NativeTransfer("soma")
