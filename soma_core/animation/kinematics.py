@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from soma_core.geometry.constants import constant
-from soma_core.geometry.torch_func import transformed
+from soma_core.geometry.torch_func import exporting, transformed
 from soma_core.geometry.tree import descendants, joint_levels
 from soma_core.rig.skeleton import Rig
 
@@ -78,6 +78,10 @@ class Kinematics(torch.nn.Module):
         self.bind_rotation = keep(bind)
         self.bind_parent_turn = keep(bind_turn[parents])
         self.ancestors = keep(descendants(rig.parents).T.astype(float))  # sums from the root down
+        jumps = [parents]
+        while 2 ** len(jumps) < len(levels):
+            jumps.append(jumps[-1][jumps[-1]])
+        self.jumps = keep(np.stack(jumps))  # to the parent, two joints up, four, ...
         first = 0  # rank, in level order, of the first joint on the level above
         for index, level in enumerate(levels):
             setattr(self, f"level_{index}", keep(level))
@@ -129,7 +133,17 @@ class Kinematics(torch.nn.Module):
         return self.ancestors @ steps
 
     def _walk(self, relative: Tensor, offsets: Tensor) -> tuple[Tensor, Tensor]:
-        """Accumulate turns and positions level by level from the root."""
+        """Accumulate turns and positions level by level from the root.
+
+        In an engine a step costs more than its products: there each joint takes up the turns of 1, 2, 4, ...
+        joints above it, which the root's, no turn, ends.
+        """
+        if exporting():
+            found = relative
+            for jump in self.jumps:
+                found = found.index_select(1, jump) @ found
+            steps = found.index_select(1, self.jumps[0]) @ offsets[..., None]
+            return found, self.ancestors @ steps.squeeze(-1)
         turns, places = [relative[:, :1]], [offsets[:, :1]]
         for index in range(len(self.level_sizes)):
             level, parent = getattr(self, f"level_{index}"), getattr(self, f"level_parent_{index}")
