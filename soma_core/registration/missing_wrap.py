@@ -66,7 +66,7 @@ def make_missing_wrap(name: str, options: Mapping[str, Any], *, registry: Regist
     if quality.faults:
         raise InputError(
             "the wrap that was made",
-            got="; ".join(quality.faults),
+            got=quality.told(),
             expected="a body that is covered, fingers one to one",
             fix=f"Name points in a file: soma wrap backend={name} landmarks=FILE out={pair.wrap.parent}",
         )

@@ -19,6 +19,9 @@ from soma_core.rig.mesh import CanonicalMesh
 
 __all__ = ["Quality", "measure"]
 
+_TOLD = 4
+"""Faults that are told; all are in the report."""
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Quality:
@@ -62,6 +65,11 @@ class Quality:
             "faults": list(self.faults),
         }
 
+    def told(self) -> str:
+        """The first faults, for a message."""
+        more = len(self.faults) - _TOLD
+        return "; ".join([*self.faults[:_TOLD], *([f"{more} more are in report.json"] if more > 0 else [])])
+
 
 def _spread(values: np.ndarray) -> dict[str, float]:
     numbers = (values.mean(), *np.percentile(values, (50, 95)), values.max())
@@ -88,7 +96,7 @@ def measure(found: Registration, mesh: CanonicalMesh) -> Quality:
     said = faults(covered, matched, digits.counts, told=found.told, gone=gone)
     said += slid(wrap, mesh, rig, found.filled)
     if not found.skin.masked:  # what a user masked is known to be gone
-        said += tuple(f"{name}: {part:.0%} of it lies over a hole of the mesh" for name, part in gone.items())
+        said += tuple(f"{name}: {part:.0%} is off the mesh, over a hole in it" for name, part in gone.items())
     return Quality(
         distance=np.where(found.filled, np.nan, distance),
         uncovered=back,

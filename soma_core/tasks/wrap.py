@@ -30,9 +30,6 @@ __all__ = ["run"]
 
 _log = logging.getLogger(__name__)
 
-_SAID = 4
-"""Faults that are said; all are in the report."""
-
 _AXES = ("+x", "-x", "+y", "-y", "+z", "-z")
 
 
@@ -67,10 +64,8 @@ def run(config: DictConfig, output: Path) -> Path:
 
 def _refusal(folder: Path, quality: Quality, *, picture: bool) -> str:
     shown = folder / ("wrap.png" if picture else "report.json")
-    more = len(quality.faults) - _SAID
-    said = [*quality.faults[:_SAID], *([f"{more} more are in report.json"] if more > 0 else [])]
     return (
-        f"{folder}: this wrap is not fit for use. {'; '.join(said)}. Look at {shown}; then pass a body with "
+        f"{folder}: this wrap is not fit for use. {quality.told()}. Look at {shown}; then pass a body with "
         'open hands that touch nothing, name points in landmarks=FILE, JSON such as {"LeftIndexTip": 1234} '
         "(soma assets landmarks lists the names), or what is no skin in mask=FILE."
     )

@@ -267,14 +267,14 @@ def test_a_browser_shows_the_bodies_and_their_sliders(layers, tmp_path):
         pixels = np.asarray(image.open(picture).convert("RGB")).astype(int)
         red, green, blue = np.moveaxis(pixels, -1, 0)
         soma = ((green > red + 8) & (green > blue + 8))[:, 320:1040].mean()
-        if soma > 0.01:
+        anny = ((red > blue + 25) & (green > blue + 12))[:, 320:1040].mean()
+        if soma > 0.01 and anny > 0.005:
             break
     close(server)
     kept = os.environ.get("SOMA_VIEW_PICTURE")
     if kept:
         seen = image.open(picture).convert("RGB").crop((320, 0, 1400, 680))  # beside what viser says of WebGL
         seen.save(kept, quality=72, method=6)
-    middle, panel = (slice(None), slice(320, 1040)), (slice(None), slice(1060, None))
     assert soma > 0.01, "no body of soma"
-    assert ((red > blue + 25) & (green > blue + 12))[middle].mean() > 0.005, "no body of anny"
-    assert ((blue > red + 80) & (blue > 180))[panel].sum() > 200, "no sliders"
+    assert anny > 0.005, "no body of anny"
+    assert ((blue > red + 80) & (blue > 180))[:, 1060:].sum() > 200, "no sliders"
