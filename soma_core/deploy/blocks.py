@@ -50,7 +50,7 @@ class BlockRows(torch.nn.Module):
     """The product with a constant sparse matrix (m, n), by gathers and dense products alone.
 
     Stands in for ``SparseRows``: ``operator(dense)`` takes (n, f) to (m, f); equal to rounding. Blocks are
-    kept transposed, and stand on the right: engines are up to seven times as fast at that where f is 1.
+    kept transposed, and stand on the right: engines are several times as fast at that where f is 1.
     """
 
     def __init__(

@@ -12,6 +12,7 @@ from soma_core.io.amass import SMPL_JOINTS, SmplMotion
 from soma_core.io.joint_order import USER_JOINTS
 from soma_core.motion import load_clip
 from soma_core.motion.smpl_turns import turns_from_smpl, turns_to_smpl
+from soma_core.native import NativeFit
 from soma_core.options import InversionChoice, PriorChoice
 from tests.motion.test_converter import converted
 
@@ -85,6 +86,21 @@ def test_a_motion_comes_back_from_smplh(smplh_models, clip, tmp_path):
     apart, angles = _trip(clip, tmp_path)
     assert apart.mean() < TRIP_MM
     assert angles[:, _LIMBS].mean() < TRIP_DEGREES
+
+
+def test_vertices_of_the_model_weigh_as_those_here(smplh_models, clip, tmp_path, monkeypatch):
+    fit, given = NativeFit.forward, []
+
+    def spy(self, vertices, **kind):
+        given.append(torch.equal(kind["weights"], self.transfer.shares))
+        return fit(self, vertices, **kind)
+
+    monkeypatch.setattr(NativeFit, "forward", spy)
+    identity = {"backend": "smplh", "params": {"betas": [0.5]}, "options": {"gender": "female"}}
+    write_motion(replace(clip, identity=identity), tmp_path / "m.npz")
+    converted(tmp_path / "m.npz", tmp_path / "there", to="smplh", up="y")
+    assert given
+    assert all(given)
 
 
 def test_without_expected_turns_a_motion_comes_back_less_well(smplh_models, clip, tmp_path):
