@@ -20,6 +20,17 @@ def _restored(kind: type[SomaError], args: tuple[object, ...], names: dict[str, 
     return error
 
 
+_LONGEST = 600
+"""Letters of what was found in a file that are told; a number of a damaged one may have thousands."""
+
+
+def _told(found: object) -> str:
+    text = str(found)
+    if len(text) <= _LONGEST:
+        return text
+    return f"{text[: _LONGEST // 2]} ... ({len(text)} letters) ... {text[-_LONGEST // 4 :]}"
+
+
 class InputError(SomaError, ValueError):
     """An argument was refused.
 
@@ -28,7 +39,7 @@ class InputError(SomaError, ValueError):
 
     def __init__(self, argument: str, *, got: object, expected: object, fix: str) -> None:
         self.argument, self.got, self.expected, self.fix = argument, got, expected, fix
-        super().__init__(f"{argument}: got {got}, expected {expected}. {fix}")
+        super().__init__(f"{argument}: got {_told(got)}, expected {expected}. {fix}")
 
 
 class AssetError(SomaError):
@@ -39,4 +50,4 @@ class AssetError(SomaError):
 
     def __init__(self, path: object, *, cause: str, fix: str) -> None:
         self.path, self.cause, self.fix = str(path), cause, fix
-        super().__init__(f"{path}: {cause}. {fix}")
+        super().__init__(f"{path}: {_told(cause)}. {fix}")

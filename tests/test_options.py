@@ -81,3 +81,11 @@ def test_errors_travel_between_processes():
     ):
         for again in (pickle.loads(pickle.dumps(error)), copy.copy(error)):
             assert (type(again), str(again), vars(again)) == (type(error), str(error), vars(error))
+
+
+def test_what_is_quoted_in_an_error_is_cut() -> None:
+    error = InputError("frames", got="9" * 5000, expected="a number", fix="Write it again.")
+    assert len(str(error)) < 1000
+    assert "(5000 letters)" in str(error)
+    assert len(error.got) == 5000
+    assert len(str(AssetError("a.json", cause="schema is " + "9" * 5000, fix="Write it again."))) < 1000

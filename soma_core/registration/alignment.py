@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from itertools import product
+from itertools import permutations, product
 from typing import cast
 
 import numpy as np
@@ -18,6 +18,9 @@ __all__ = ["Start", "find_starts"]
 
 _ARMS = (0.0, 0.5, 1.0, 1.4, 1.8)
 """Poses that are tried, on the way from the T-pose (0) to the bind pose (1) and on to hanging arms."""
+
+_UNSURE = 0.7
+"""Cost of the best start with both arms alike, from which on arms that differ are tried too."""
 
 _ROUGHLY, _LEFT = 200, 12
 """Samples in a first look at all starts, and how many of these are looked at well."""
@@ -53,7 +56,6 @@ def find_starts(
     extent = np.ptp(skin.vertices, axis=0)
     unit = unit or find_unit(float(extent.max()))
     centre = cast("tuple[float, float, float]", tuple((skin.vertices.max(0) + skin.vertices.min(0)) / 2))
-    bodies = [(pose := model.start(share), _mean_body(model, pose)) for share in _ARMS]
     axes = product([up] if up else _AXES, [forward] if forward else _AXES)
     frames = [
         Frame(unit=unit, up=high, forward=ahead, centre=centre) for high, ahead in axes if high[1] != ahead[1]
@@ -63,15 +65,27 @@ def find_starts(
             "forward", got=repr(forward), expected=f"an axis across up={up!r}", fix="Correct one of the two."
         )
     surfaces = [skin.surface(frame) for frame in frames]
-    tried = [(*each, *body) for each in zip(surfaces, frames, strict=True) for body in bodies]
+    placed = [*zip(surfaces, frames, strict=True)]
+    found = _best_starts(placed, [(share, share) for share in _ARMS], model, count)
+    if found[0][0].cost > _UNSURE:
+        found += _best_starts(placed, [*permutations(_ARMS, 2)], model, count)
+    found = sorted(found, key=lambda start: start[0].cost)[:count]
+    return [_sized(start, size, model) for start, size in found]
+
+
+def _best_starts(
+    placed: list[tuple[Surface, Frame]], arms: list[tuple[float, float]], model: BodyModel, count: int
+) -> list[tuple[Start, float]]:
+    """The best starts with arms so far from the T-pose, left and right, best first, and how large each is."""
+    bodies = [(pose := model.start(*each), _mean_body(model, pose)) for each in arms]
+    tried = [(*each, *body) for each in placed for body in bodies]
     costs = [_start(*each, model, _ROUGHLY).cost for each in tried]
     best = [tried[index] for index in np.argsort(costs, kind="stable")[: max(_LEFT, count)]]
     starts = [
         (_start(surface, frame, pose, body, model, _SAMPLES), _size(surface, body))
         for surface, frame, pose, body in best
     ]
-    found = sorted(starts, key=lambda start: start[0].cost)[:count]
-    return [_sized(start, size, model) for start, size in found]
+    return sorted(starts, key=lambda start: start[0].cost)[:count]
 
 
 def _mean_body(model: BodyModel, pose: BodyPose) -> Surface:

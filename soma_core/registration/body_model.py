@@ -74,13 +74,15 @@ class BodyModel:
         self.ends = np.array([bool(_ENDS.search(names[j])) for j in self.joints])
         self.partner = np.array([names.index(_other_side(name)) for name in names])
 
-    def start(self, share: float) -> BodyPose:
-        """A mean body, hips at the origin, `share` of the way from the T-pose to the bind pose."""
+    def start(self, left: float, right: float | None = None) -> BodyPose:
+        """A mean body, hips at the origin; each side so far from the T-pose (0) to the bind pose (1)."""
         bind, orient = (np.asarray(t)[:, :3, :3] for t in (self.rig.bind_world, self.rig.t_pose_world))
         displaced = bind @ orient.transpose(0, 2, 1)
         parent = np.maximum(self.rig.parents, 0)
         relative = (displaced[parent].transpose(0, 2, 1) @ displaced)[1:]
-        part = Rotation.from_rotvec(share * Rotation.from_matrix(relative).as_rotvec()).as_matrix()
+        others = left if right is None else right
+        share = np.array([others if name.startswith("Right") else left for name in self.layer.joint_names])
+        part = Rotation.from_rotvec(share[:, None] * Rotation.from_matrix(relative).as_rotvec()).as_matrix()
         part[0] = np.eye(3)
         return BodyPose(shape=np.zeros(self.count), rotations=part, hips=np.zeros(3))
 

@@ -15,7 +15,10 @@ __all__ = ["refuse_distant", "refuse_unlike"]
 _UNLIKE = 1.0
 """Cost of the best start, of 2, beyond which no stance comes near: people have up to 0.6, a sphere 1.5."""
 
-_FIX = "Pass one human body in a T- or A-pose; if it is one, say unit=, up= and forward=."
+_FIX = (
+    "Pass one human body that stands, each arm out to its side, down or between; if it is one, say unit=, "
+    "up= and forward=."
+)
 
 
 def refuse_unlike(best: Start) -> None:

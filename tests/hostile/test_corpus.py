@@ -63,7 +63,6 @@ def test_hostile_files_are_refused(reader, name, ask):
         return
     assert told is not None, "was read"
     assert re.search(r"(hostile|MANIFEST)[^ ]*: ?\S", told)
-    assert len(told) < 2000
 
 
 @each_reader

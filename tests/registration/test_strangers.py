@@ -7,11 +7,13 @@ import pytest
 
 from soma_core.errors import InputError
 from soma_core.layer import SomaLayer
+from soma_core.registration.alignment import find_starts
 from soma_core.registration.body_fit import BodyFit
 from soma_core.registration.body_model import BodyModel
 from soma_core.registration.register import register
 from soma_core.registration.strangers import refuse_distant
 from soma_core.registration.surface import Surface
+from soma_core.registration.target import Skin
 from tests.registration.test_target import sphere
 
 SHARE = 0.01
@@ -54,6 +56,16 @@ def mean() -> tuple[BodyModel, BodyFit]:
     model = BodyModel(SomaLayer("soma", lod="low", procedural=False))
     pose = model.start(0.5)
     return model, BodyFit(pose=pose, vertices=model.evaluate(pose)[0], cost=0.0)
+
+
+@pytest.mark.parametrize("arms", [(0.0, 1.8), (1.4, 0.0)])
+def test_one_arm_up_and_one_hanging_are_found(mean, arms) -> None:
+    model, _ = mean
+    pose = model.start(*arms)
+    skin = Skin(vertices=model.evaluate(pose)[0], triangles=model.triangles)
+    best, *_ = find_starts(skin, model, unit=None, up="+y", forward=None, count=1)
+    assert best.frame.forward == "+z"
+    np.testing.assert_allclose(best.pose.rotations, pose.rotations, atol=1e-6)
 
 
 def test_a_body_on_its_own_surface_is_let_through(mean) -> None:
