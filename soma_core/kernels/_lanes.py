@@ -16,7 +16,7 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from soma_core.kernels._runtime import launching
+from soma_core.kernels._runtime import launching, loaded
 
 __all__ = ["ABREAST", "as_lanes", "as_rows", "frame_rows", "from_lanes", "in_threads", "lane_count",
            "lane_types", "launch", "row_of", "to_lanes", "worker_count", "working_rows"]  # fmt: skip
@@ -170,9 +170,8 @@ def row_of(scalar: str) -> wp.Function:
 def launch(kernel: wp.Kernel, workers: int, inputs: Sequence, like: Tensor) -> None:
     """Start a kernel where `like` is; on a GPU in blocks of one warp, which spread best."""
     with launching(like) as device:
-        wp.launch(
-            kernel, dim=workers, inputs=inputs, device=device, block_dim=ABREAST if like.is_cuda else 256
-        )
+        block = ABREAST if like.is_cuda else 1
+        wp.launch(loaded(kernel, device), dim=workers, inputs=inputs, device=device, block_dim=block)
 
 
 def in_threads(run: Callable[[slice], None], count: int, like: Tensor) -> None:

@@ -8,6 +8,7 @@ import logging
 import os
 import sys
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import torch
@@ -15,7 +16,7 @@ import warp as wp
 
 from soma_core.errors import InputError
 
-__all__ = ["as_warp", "launching", "scalar_name", "start"]
+__all__ = ["as_warp", "launching", "loaded", "scalar_name", "start"]
 
 _log = logging.getLogger(__name__)
 
@@ -93,3 +94,26 @@ def launching(tensor: torch.Tensor) -> Iterator[Any]:
     handle = torch.cuda.current_stream(tensor.device).cuda_stream
     with wp.ScopedStream(_stream(device.alias, handle), sync_enter=False):
         yield device
+
+
+def loaded(kernel: wp.Kernel, device: Any) -> wp.Kernel:
+    """The same kernel, once it can run on a CPU; on CUDA a launch loads it.
+
+    One thread of the process compiles them all. Warp 1.19 lets threads that launch the same kernel each
+    compile it, and makes its precompiled header, most of the time of a module, anew in every thread.
+    """
+    if not wp.get_device(device).is_cuda:
+        _load(os.getpid(), kernel)
+    return kernel
+
+
+@functools.cache
+def _load(process: int, kernel: wp.Kernel) -> None:
+    load = functools.partial(wp.load_module, kernel.module, device="cpu", block_dim=1, max_workers=0)
+    _compiler(process).submit(load).result()
+
+
+@functools.cache
+def _compiler(_process: int) -> ThreadPoolExecutor:
+    """The thread that compiles; a forked process has its own."""
+    return ThreadPoolExecutor(1, thread_name_prefix="soma-compiler")

@@ -3,7 +3,7 @@
 import numpy as np
 import warp as wp
 
-from soma_core.kernels._runtime import start
+from soma_core.kernels._runtime import loaded, start
 
 __all__ = ["closest_faces", "face_table", "nearest_touching"]
 
@@ -33,7 +33,7 @@ def closest_faces(points: np.ndarray, vertices: np.ndarray, triangles: np.ndarra
     )
     found = wp.empty(len(points), dtype=wp.int32, device="cpu")
     queries = wp.array(points.astype(np.float32), dtype=wp.vec3, device="cpu")
-    wp.launch(_closest, dim=len(points), inputs=[mesh.id, queries, found], device="cpu")
+    wp.launch(loaded(_closest, "cpu"), dim=len(points), inputs=[mesh.id, queries, found], device="cpu")
     return found.numpy().astype(np.int64)
 
 
@@ -142,7 +142,7 @@ def nearest_touching(points: np.ndarray, proposed: np.ndarray, faces: _Faces, sl
     """
     found = wp.empty(len(points), dtype=wp.int32, device="cpu")
     inputs = [faces, _on_cpu(points, wp.vec3d), _on_cpu(proposed, wp.int32), slack, found]
-    wp.launch(_touching, dim=len(points), inputs=inputs, device="cpu")
+    wp.launch(loaded(_touching, "cpu"), dim=len(points), inputs=inputs, device="cpu")
     return found.numpy().astype(np.int64)
 
 

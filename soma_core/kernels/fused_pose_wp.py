@@ -15,7 +15,7 @@ from soma_core.kernels._lanes import in_threads
 from soma_core.kernels._native import native
 from soma_core.kernels._patch_text import patch_text
 from soma_core.kernels._posing_text import body_text
-from soma_core.kernels._runtime import as_warp, launching, scalar_name
+from soma_core.kernels._runtime import as_warp, launching, loaded, scalar_name
 
 __all__ = ["pose_bodies", "skin_patches"]
 
@@ -93,7 +93,13 @@ def _patch_kernel(scalar: str, *, single: bool) -> wp.Kernel:
 def _launch(kernel: wp.Kernel, blocks: int, threads: int, given: list, device: wp.Device) -> None:
     """Launch whole blocks; on the CPU each is one thread, as the native bodies expect."""
     threads = threads if device.is_cuda else 1
-    wp.launch(kernel, dim=blocks * threads, inputs=[threads, *given], device=device, block_dim=threads)
+    wp.launch(
+        loaded(kernel, device),
+        dim=blocks * threads,
+        inputs=[threads, *given],
+        device=device,
+        block_dim=threads,
+    )
 
 
 def _flat(tensor: Tensor):

@@ -10,7 +10,7 @@ import warp as wp
 from torch import Tensor
 
 from soma_core.geometry.torch_func import operator
-from soma_core.kernels._runtime import as_warp, launching, scalar_name
+from soma_core.kernels._runtime import as_warp, launching, loaded, scalar_name
 
 __all__ = ["fitted_world", "to_bind_pose"]
 
@@ -110,7 +110,7 @@ def _fitted_world(displacement: Tensor, source: Tensor, bind_rotation: Tensor, j
             as_warp(displacement, kernels.mat33), as_warp(source), as_warp(bind_rotation, kernels.mat33),
             as_warp(joints, kernels.vec3), as_warp(out, kernels.mat44),
         ]  # fmt: skip
-        wp.launch(kernels.assemble, dim=(batch, count), inputs=given, device=device)
+        wp.launch(loaded(kernels.assemble, device), dim=(batch, count), inputs=given, device=device)
     return out
 
 
@@ -136,7 +136,7 @@ def _to_bind_pose(
             as_warp(fitted, kernels.mat44), as_warp(parents), *constants, as_warp(world, kernels.mat44),
             as_warp(skin, kernels.mat34),
         ]  # fmt: skip
-        wp.launch(kernels.rebind, dim=(batch, count), inputs=given, device=device)
+        wp.launch(loaded(kernels.rebind, device), dim=(batch, count), inputs=given, device=device)
     return world, skin
 
 

@@ -8,7 +8,7 @@ import warp as wp
 from torch import Tensor
 
 from soma_core.geometry.torch_func import operator
-from soma_core.kernels._runtime import as_warp, launching, scalar_name
+from soma_core.kernels._runtime import as_warp, launching, loaded, scalar_name
 
 __all__ = ["forward_kinematics"]
 
@@ -47,7 +47,7 @@ def _walk(relative: Tensor, offsets: Tensor, order: Tensor, parents: Tensor) -> 
         return turns, positions
     with launching(relative) as device:
         wp.launch(
-            kernels.walk,
+            loaded(kernels.walk, device),
             dim=len(relative),
             inputs=[as_warp(order), as_warp(parents), as_warp(relative, kernels.mat33),
                     as_warp(offsets, kernels.vec3)],
@@ -81,7 +81,7 @@ def _walk_backward(
     positions_grad = positions_grad.clone(memory_format=torch.contiguous_format)
     with launching(relative) as device:
         wp.launch(
-            kernels.walk,
+            loaded(kernels.walk, device),
             dim=len(relative),
             inputs=[as_warp(order), as_warp(parents), as_warp(relative, matrices), as_warp(offsets, vectors)],
             outputs=[as_warp(turns, matrices), as_warp(positions, vectors)],

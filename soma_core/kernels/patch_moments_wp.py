@@ -15,7 +15,7 @@ from torch import Tensor
 from soma_core.kernels._native import native
 from soma_core.kernels._patch_text import PATCH_VERTICES
 from soma_core.kernels._posing_text import THREADS
-from soma_core.kernels._runtime import as_warp, launching, scalar_name
+from soma_core.kernels._runtime import as_warp, launching, loaded, scalar_name
 from soma_core.kernels.residual_patches import joint_lists
 
 __all__ = ["MomentPatches", "moments_by_patches"]
@@ -213,8 +213,13 @@ def _launch(
         ]  # fmt: skip
         kernel = _kernel(scalar, single=group == 1)
         dim = groups * tables.count * threads
-        wp.launch(kernel, dim=dim, inputs=inputs, device=device, block_dim=threads)
+        wp.launch(loaded(kernel, device), dim=dim, inputs=inputs, device=device, block_dim=threads)
         arrays = tables.items, tables.cells, tables.near, mean, vertices, sums, out, origin
         joints = len(mean)
         inputs = [batch, group, lists, joints, size, *(as_warp(one.view(-1)) for one in arrays)]
-        wp.launch(_totals(scalar), dim=groups * (12 * joints + 3) * group, inputs=inputs, device=device)
+        wp.launch(
+            loaded(_totals(scalar), device),
+            dim=groups * (12 * joints + 3) * group,
+            inputs=inputs,
+            device=device,
+        )

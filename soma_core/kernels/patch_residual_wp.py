@@ -15,7 +15,7 @@ from torch import Tensor
 from soma_core.kernels._native import native
 from soma_core.kernels._patch_residual_text import FLAGS, patch_residual_text
 from soma_core.kernels._patch_text import PATCH_VERTICES
-from soma_core.kernels._runtime import as_warp, launching, scalar_name
+from soma_core.kernels._runtime import as_warp, launching, loaded, scalar_name
 from soma_core.kernels.residual_patches import ResidualPatches
 
 __all__ = ["residual_by_patches"]
@@ -179,8 +179,8 @@ def _launch(
         ]  # fmt: skip
         kernel = _kernel(scalar, single=group == 1)
         dim = groups * patches.count * threads
-        wp.launch(kernel, dim=dim, inputs=inputs, device=device, block_dim=threads)
+        wp.launch(loaded(kernel, device), dim=dim, inputs=inputs, device=device, block_dim=threads)
         sizes = batch, group, cells, entries, tables.joint_count, *names
         arrays = tables.items, tables.cells, sums, energy, forces, pull
         inputs = [*sizes, *(as_warp(one.view(-1)) for one in arrays)]
-        wp.launch(_totals(scalar), dim=groups * entries * group, inputs=inputs, device=device)
+        wp.launch(loaded(_totals(scalar), device), dim=groups * entries * group, inputs=inputs, device=device)

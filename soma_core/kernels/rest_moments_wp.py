@@ -9,7 +9,7 @@ import warp as wp
 from torch import Tensor
 
 from soma_core.kernels._native import native
-from soma_core.kernels._runtime import as_warp, launching, scalar_name
+from soma_core.kernels._runtime import as_warp, launching, loaded, scalar_name
 
 __all__ = ["rest_moments"]
 
@@ -111,8 +111,8 @@ def rest_moments(
     first = [start, vertex, skin, turn_, centre_, rest_, weight_, point_, own_]
     second = [as_warp(pairs[0]), as_warp(pairs[1].view(-1)), vertex, skin, weight_, point_, coupled_]
     with launching(rest) as device:
-        wp.launch(place, dim=len(own), inputs=first, device=device)
-        wp.launch(couple, dim=len(coupled), inputs=second, device=device)
+        wp.launch(loaded(place, device), dim=len(own), inputs=first, device=device)
+        wp.launch(loaded(couple, device), dim=len(coupled), inputs=second, device=device)
     return point, own, coupled
 
 

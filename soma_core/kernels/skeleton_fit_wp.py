@@ -14,7 +14,7 @@ from torch import Tensor
 
 from soma_core.geometry.kabsch import PRIOR_STRENGTH
 from soma_core.geometry.torch_func import operator
-from soma_core.kernels._runtime import as_warp, launching, scalar_name
+from soma_core.kernels._runtime import as_warp, launching, loaded, scalar_name
 from soma_core.kernels.rotation_functions_wp import bone_functions, kabsch_function
 
 __all__ = ["fit_displacements"]
@@ -266,7 +266,7 @@ def _fit(
         return out
     with launching(joints) as device:
         wp.launch(
-            _displace(scalar),
+            loaded(_displace(scalar), device),
             dim=tuple(out.shape[:2]),
             inputs=[as_warp(pivots), as_warp(children), as_warp(bind, types.vec3),
                     as_warp(joints, types.vec3), as_warp(covariances, types.mat33)],
@@ -295,7 +295,7 @@ def _fit_backward(
         return joints_grad, covariances_grad
     with launching(joints) as device:
         wp.launch(
-            _pull_back(scalar),
+            loaded(_pull_back(scalar), device),
             dim=tuple(grad.shape[:2]),
             inputs=[as_warp(pivots), as_warp(children), as_warp(bind, types.vec3),
                     as_warp(joints, types.vec3), as_warp(covariances, types.mat33),

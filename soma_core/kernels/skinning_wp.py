@@ -9,7 +9,7 @@ from torch import Tensor
 
 from soma_core.geometry.sparse import Csr
 from soma_core.geometry.torch_func import operator
-from soma_core.kernels._runtime import as_warp, launching, scalar_name
+from soma_core.kernels._runtime import as_warp, launching, loaded, scalar_name
 
 __all__ = ["skin"]
 
@@ -88,7 +88,7 @@ def _skin(
         return out
     with launching(points) as device:
         wp.launch(
-            kernels.forward,
+            loaded(kernels.forward, device),
             dim=tuple(points.shape[:2]),
             inputs=[as_warp(crow), as_warp(col), as_warp(val), as_warp(transforms, kernels.vec4),
                     as_warp(points, kernels.vec3), as_warp(out, kernels.vec3)],
@@ -116,14 +116,14 @@ def _skin_backward(
     warp_grad = as_warp(grad, kernels.vec3)
     with launching(points) as device:
         wp.launch(
-            kernels.points_backward,
+            loaded(kernels.points_backward, device),
             dim=tuple(points.shape[:2]),
             inputs=[as_warp(crow), as_warp(col), as_warp(val), as_warp(transforms, kernels.vec4), warp_grad,
                     as_warp(points_grad, kernels.vec3)],
             device=device,
         )  # fmt: skip
         wp.launch(
-            kernels.transforms_backward,
+            loaded(kernels.transforms_backward, device),
             dim=tuple(transforms.shape[:2]),
             inputs=[as_warp(t_crow), as_warp(t_col), as_warp(t_val), as_warp(points, kernels.vec3), warp_grad,
                     as_warp(transforms_grad, kernels.vec4)],

@@ -6,7 +6,7 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from soma_core.kernels._runtime import as_warp, launching, scalar_name
+from soma_core.kernels._runtime import as_warp, launching, loaded, scalar_name
 from soma_core.kernels.rotation_functions_wp import kabsch_function
 
 __all__ = ["surface_frames"]
@@ -52,7 +52,7 @@ def surface_frames(transforms: Tensor, crow: Tensor, col: Tensor, moments: Tenso
         return out
     with launching(transforms) as device, torch.no_grad():
         wp.launch(
-            kernel,
+            loaded(kernel, device),
             dim=tuple(out.shape[:2]),
             inputs=[as_warp(crow), as_warp(col), as_warp(moments, vec3), as_warp(centre, vec3),
                     as_warp(transforms, vec4), as_warp(out, mat33)],
