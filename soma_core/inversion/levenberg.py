@@ -8,7 +8,6 @@ from typing import Protocol, TypeVar
 
 import numpy as np
 import scipy.linalg
-import scipy.optimize
 
 __all__ = ["Damping", "bounded_step", "descend", "promising"]
 
@@ -78,11 +77,13 @@ def bounded_step(
     unknowns: Bounded, point: np.ndarray, matrix: np.ndarray, slope: np.ndarray, damping: float
 ) -> np.ndarray:
     """The minimum of the damped quadratic inside the bounds."""
+    from scipy.optimize import lsq_linear  # ninety modules, which a motion without a fit does not need
+
     damped = matrix + damping * np.diag(np.diag(matrix))
     factor = np.linalg.cholesky(damped)
     goal = scipy.linalg.solve_triangular(factor, -slope, lower=True)
     bounds = unknowns.lower - point, unknowns.upper - point
-    return point + scipy.optimize.lsq_linear(factor.T, goal, bounds, method="bvls").x
+    return point + lsq_linear(factor.T, goal, bounds, method="bvls").x
 
 
 def promising(
