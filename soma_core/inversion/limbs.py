@@ -163,7 +163,6 @@ class TwistShare:
         offsets: what tells the share.
         joints: (T,) weighted joints, helpers among them.
         pairs: (p, 2) of them that share vertices.
-        fitted: (v,) vertices that count.
     """
 
     def __init__(
@@ -173,7 +172,6 @@ class TwistShare:
         offsets: PoseOffsets,
         joints: np.ndarray,
         pairs: np.ndarray,
-        fitted: np.ndarray,
     ) -> None:
         assert rig.procedural is not None
         self.driven, self.offsets = driven, offsets
@@ -198,7 +196,7 @@ class TwistShare:
                     own=own, end=end, channels=(channel.index(own), channel.index(end)),
                     axis=driven.spin_axis[int(helpers[0]) - rig.joint_count],
                     **{name: torch.as_tensor(array, device=device) for name, array in index.items()},
-                    **offsets.seen_by(own, end, fitted),
+                    **offsets.seen_by(own, end),
                 )
             )  # fmt: skip
 

@@ -58,7 +58,7 @@ class PoseModel(SkinModel):
                 correctives, rig, structure.joints, fitted, some=some, **kind
             )
             if driven is not None:
-                share = TwistShare(whole, driven, offsets, structure.joints, structure.pairs, fitted)
+                share = TwistShare(whole, driven, offsets, structure.joints, structure.pairs)
         super().__init__(
             rig, structure, layer.animation, driven=driven, offsets=offsets, limbs=limbs, warp=warp, **kind
         )

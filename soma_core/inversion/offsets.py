@@ -57,6 +57,8 @@ class PoseOffsets(torch.nn.Module):
         gram: (P K, P K) products of modes.
         torque, force: (T, 3, P K) of modes on the weighted joints' clouds, in the joints' own axes.
         extent, mass: (T,) root mean square arm [m] and weight of each cloud.
+        products: (C, C) of shapes, over the vertices that count.
+        least: value of a mode there, below which it is left out.
     """
 
     def __init__(
@@ -85,10 +87,14 @@ class PoseOffsets(torch.nn.Module):
         self.still = keep(still)
         blocks = _blocks(first, owner, len(left), 3 * self.columns)
         self.taken, self.reads, self.gate = (keep(blocks[name]) for name in ("taken", "reads", "gate"))
-        modes, moved = _modes(shapes, blocks["taken"], fitted)
-        self.modes = keep(modes)
-        made = {name: keep(array) for name, array in _moments(moved, rig, joints, fitted).items()}
-        self.gram, self.torque, self.force = made["gram"], made["torque"], made["force"]
+        counted = scipy.sparse.csr_array(scipy.sparse.diags_array(np.repeat(fitted * 1.0, 3)) @ shapes)
+        part = counted if counted.nnz < _FILLED * np.prod(shapes.shape) else counted.toarray()
+        self.products = scipy.sparse.csr_array(part.T @ part)
+        self.least = _LEAST_MODE**2 * fitted.sum()
+        modes, mixing = _modes(self.products, blocks["taken"], self.least)
+        self.modes, self.gram = keep(modes), keep((mixing.T @ (self.products @ mixing)).toarray())
+        made = {name: keep(array) for name, array in _moments(part, mixing, rig, joints, fitted).items()}
+        self.torque, self.force = made["torque"], made["force"]
         self.extent, self.mass = made["extent"], made["mass"]
 
     @classmethod
@@ -141,7 +147,7 @@ class PoseOffsets(torch.nn.Module):
         turned = (self.left[joint] @ relative @ self.right[joint])[..., : self.columns] - self.still[joint]
         return turned.flatten(-2)
 
-    def seen_by(self, own: int, end: int, fitted: np.ndarray) -> dict[str, Tensor]:
+    def seen_by(self, own: int, end: int) -> dict[str, Tensor]:
         """Activations that read either of two joints: their ids, how they read them, and their shapes.
 
         Shapes come in coordinates (c, r) of their own, of which small ones are left out.
@@ -152,10 +158,9 @@ class PoseOffsets(torch.nn.Module):
             block, place = torch.nonzero(self.reads == joint, as_tuple=True)
             reads[self.taken[block].flatten(), which] = self.gate[block, :, place].flatten(0, 1)
         ids = torch.nonzero((reads[:-1] != 0).any(-1).any(-1)).flatten()
-        shapes = self.shapes.scipy()[:, ids.cpu().numpy()]
-        counted = scipy.sparse.diags_array(np.repeat(fitted.astype(np.float64), 3)) @ shapes
-        values, vectors = np.linalg.eigh((shapes.T @ counted).toarray())
-        kept = values > fitted.sum() * _LEAST_MODE**2
+        of = ids.cpu().numpy()
+        values, vectors = np.linalg.eigh(self.products[of][:, of].toarray())
+        kept = values > self.least
         coordinates = vectors[:, kept] * np.sqrt(values[kept])
         return {
             "ids": ids, "by_own": reads[ids, 0], "by_end": reads[ids, 1],
@@ -296,52 +301,43 @@ def _blocks(
 
 
 def _modes(
-    shapes: scipy.sparse.csr_array, taken: np.ndarray, fitted: np.ndarray
-) -> tuple[np.ndarray, scipy.sparse.csr_array | np.ndarray]:
-    """Modes (P, K, C') of each block, orthonormal, and what one unit of each moves, (3 v, P K)."""
-    counted = (scipy.sparse.diags_array(np.repeat(fitted.astype(np.float64), 3)) @ shapes).tocsc()
-    least = _LEAST_MODE * np.sqrt(fitted.sum())
-    found = []
+    products: scipy.sparse.csr_array, taken: np.ndarray, least: float
+) -> tuple[np.ndarray, scipy.sparse.csr_array]:
+    """Modes (P, K, C') of each block, orthonormal, and the same as columns (C, P K)."""
+    count, found = products.shape[0], []
     for row in taken:
-        part = counted[:, row[row < shapes.shape[1]]]
-        square = (part.T @ part).toarray()
-        values, vectors = np.linalg.eigh(square)
-        kept = np.flatnonzero(values > least**2)[::-1]
-        found.append(vectors[:, kept].T)
-    width = max(1, *map(len, found))
-    modes = np.zeros((len(taken), width, taken.shape[1]))
-    columns, rows, weights = [], [], []
-    for p, (row, part) in enumerate(zip(taken, found, strict=True)):
-        ids = row[row < shapes.shape[1]]
-        modes[p, : len(part), : len(ids)] = part
-        k, c = np.meshgrid(p * width + np.arange(len(part)), ids, indexing="ij")
-        columns.append(k.ravel())
-        rows.append(c.ravel())
-        weights.append(part.ravel())
-    mixing = scipy.sparse.csr_array(
-        (np.concatenate(weights), (np.concatenate(rows), np.concatenate(columns))),
-        shape=(shapes.shape[1], len(taken) * width),
-    )
-    if counted.nnz < _FILLED * np.prod(shapes.shape):
-        return modes, scipy.sparse.csr_array(counted @ mixing)
-    return modes, counted.toarray() @ mixing.toarray()
+        ids = row[row < count]
+        values, vectors = np.linalg.eigh(products[ids][:, ids].toarray())
+        found.append(vectors[:, np.flatnonzero(values > least)[::-1]].T)
+    modes = np.zeros((len(taken), max(1, *map(len, found)), taken.shape[1]))
+    for p, part in enumerate(found):
+        modes[p, : part.shape[0], : part.shape[1]] = part
+    block, mode, own = np.nonzero(modes)
+    width = modes.shape[1]
+    at = (taken[block, own], block * width + mode)
+    return modes, scipy.sparse.csr_array((modes[block, mode, own], at), shape=(count, len(taken) * width))
 
 
 def _moments(
-    moved: scipy.sparse.csr_array | np.ndarray, rig: Rig, joints: np.ndarray, fitted: np.ndarray
+    counted: scipy.sparse.csr_array | np.ndarray,
+    mixing: scipy.sparse.csr_array,
+    rig: Rig,
+    joints: np.ndarray,
+    fitted: np.ndarray,
 ) -> dict[str, np.ndarray]:
-    """Products of modes, and their torque about and force on each weighted joint, in the joint's own axes."""
-    planes = [moved[axis::3] for axis in range(3)]
+    """Torque of modes about and force on each weighted joint, in its own axes; its extent and mass.
+
+    Args:
+        counted: (3 v, C) shapes, without vertices that do not count.
+        mixing: of :func:`_modes`.
+        rig, joints, fitted: as of :class:`PoseOffsets`.
+    """
     weights = scipy.sparse.csr_array(rig.skin.tocsc()[:, joints].T @ scipy.sparse.diags_array(fitted * 1.0))
-    force = np.stack([_full(weights @ plane) for plane in planes], 1)  # (T, 3, M)
-    arms = [
-        scipy.sparse.csr_array(weights @ scipy.sparse.diags_array(rig.bind_shape[:, a])) for a in range(3)
-    ]
-
-    def moment(arm: int, plane: int) -> np.ndarray:
-        return _full(arms[arm] @ planes[plane])
-
-    torque = np.stack([moment(b, c) - moment(c, b) for b, c in ((1, 2), (2, 0), (0, 1))], 1)
+    arms = [weights @ scipy.sparse.diags_array(rig.bind_shape[:, axis]) for axis in range(3)]
+    rows = scipy.sparse.csr_array(scipy.sparse.vstack([weights, *arms]))
+    planes = [_full((rows @ counted[axis::3]) @ mixing) for axis in range(3)]
+    force, *moment = np.stack(planes, 1).reshape(4, len(joints), 3, -1)  # (T, 3, M) each
+    torque = np.stack([moment[b][:, c] - moment[c][:, b] for b, c in ((1, 2), (2, 0), (0, 1))], 1)
     centre = rig.bind_world[joints, :3, 3]
     torque -= np.cross(centre[:, :, None], force, axis=1)
     orient = rig.t_pose_world[joints, :3, :3].copy()
@@ -352,8 +348,7 @@ def _moments(
     spread = square - 2 * (centre * arm.T).sum(1) + mass * (centre**2).sum(1)
     extent = np.sqrt(spread / mass.clip(1e-12)).clip(1e-6)
     return {
-        "gram": _full(moved.T @ moved), "torque": turn @ torque, "force": turn @ force, "extent": extent,
-        "mass": mass.clip(1e-12),
+        "torque": turn @ torque, "force": turn @ force, "extent": extent, "mass": mass.clip(1e-12),
     }  # fmt: skip
 
 

@@ -167,7 +167,7 @@ def test_what_a_limbs_joints_see_is_what_its_activations_read_and_move():
     layer, model = shipped()
     names = list(layer.rig.joint_names)
     own, end = names.index("LeftArm"), names.index("LeftForeArm")
-    seen = model.offsets.seen_by(own, end, model.fitted)
+    seen = model.offsets.seen_by(own, end)
     change = torch.zeros(1, model.offsets.shapes.shape[1], dtype=torch.float64)
     change[0, seen["ids"]] = randn(len(seen["ids"]), seed=3)
     moved = model.offsets.shapes(change.T.contiguous()).view(-1, 3)[torch.as_tensor(model.fitted)]
