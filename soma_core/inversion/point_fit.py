@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -17,12 +17,13 @@ from soma_core.inversion.point_rows import PointRows, rows_of
 from soma_core.inversion.point_start import PointStart
 from soma_core.inversion.problem import Pose, part_of
 from soma_core.inversion.result import InversionResult
+from soma_core.kernels._threads import in_parts
 from soma_core.skeleton.identity import Identity
 
-__all__ = ["FEWEST", "PointFit", "PointResult", "bridged", "determined", "paces", "trusted"]
+__all__ = ["FEWEST", "SEVERAL", "PointFit", "PointResult", "bridged", "determined", "paces", "trusted"]
 
-_CHUNK = 2048
-"""Frames fitted at a time."""
+_CHUNK, SEVERAL = 2048, 256
+"""Frames fitted at a time at most, and how many are worth a thread of their own."""
 
 _FIRST_NOISE, _LEAST_NOISE, _MOST_NOISE = 3e-4, 5e-5, 0.2
 """Noise of a coordinate [m]: taken while it is estimated, so that points have their way; its bounds."""
@@ -106,6 +107,7 @@ class PointFit:
         bone_scale: (1 or F, J - 1); None without.
         noise: of a coordinate [m]; None to estimate it.
         iterations: largest number of steps of each look.
+        threads: for parts of the frames.
     """
 
     def __init__(
@@ -119,10 +121,11 @@ class PointFit:
         *,
         noise: float | None,
         iterations: int,
+        threads: int = 1,
     ) -> None:
         self.model, self.start, self.identity, self.bone_scale = model, start, identity, bone_scale
         self.weights, self.rest = weights, model.rest(identity, bone_scale)
-        self.given, self.iterations = noise, iterations
+        self.given, self.iterations, self.threads = noise, iterations, threads
         self.every = every = weights.expand(len(points), -1)
         self.sure, self.valid = every, (every > 0).sum(1) >= FEWEST
         total = every.sum(1, keepdim=True).clamp_min(1e-12)
@@ -134,23 +137,28 @@ class PointFit:
         still = model.mean.expand(len(points), -1, 3, 3)
         self.pose = Pose.begin(still, torch.zeros_like(self.origin))
 
-    def chunks(self) -> Iterator[_Chunk]:
-        """The frames, some at a time."""
-        for first in range(0, len(self.points), _CHUNK):
-            part = slice(first, first + _CHUNK)
+    def _chunks(self) -> Iterator[_Chunk]:
+        """The frames, some at a time: as many for every thread."""
+        count = len(self.points)
+        parts = self.threads * max(1, -(-count // (self.threads * _CHUNK)))
+        size = max(1, -(-count // parts))
+        for first in range(0, count, size):
+            part = slice(first, first + size)
             pose = Pose(**{name: value[part] for name, value in vars(self.pose).items()})
             weights = self.weights if len(self.weights) == 1 else self.weights[part]
             yield _Chunk(part, self._rest_of(part), self.points[part] - self.shift[part], weights, pose)
 
+    def _each(self, run: Callable[[_Chunk], Any]) -> list[Any]:
+        """What comes of every chunk."""
+        return in_parts(run, list(self._chunks()), self.threads)
+
     def _rest_of(self, part: slice | Tensor) -> PointRest:
         rest = self.rest
-        if len(rest.local) == 1:
-            return rest
-        return PointRest(local=rest.local[part], offsets=rest.offsets[part])
+        return rest if len(rest.local) == 1 else PointRest(local=rest.local[part], offsets=rest.offsets[part])
 
     def begin(self, initial: InversionResult | None, *, named: str = "points") -> None:
         """Start from the points, or from an earlier result; `named` is what is in another unit, if so."""
-        begun = [self.start(one.rest, one.points, one.weights) for one in self.chunks()]
+        begun = self._each(lambda one: self.start(one.rest, one.points, one.weights))
         relative, hips, scale = (torch.cat(parts) for parts in zip(*begun, strict=True))
         scale = scale[torch.isfinite(scale)]
         if len(scale):
@@ -239,21 +247,25 @@ class PointFit:
 
         With `held` what the points leave open stays as it is, and nothing pulls at what they tell.
         """
-        done, still = [], _STILL * noise * (0.1 if held else 1.0)
-        for one in self.chunks():
-            moments = self.model.moments(one.rest, one.weights, noise**2, held=held)
-            target = self.model.target(one.rest, one.points, one.weights)
+        still, model = _STILL * noise * (0.1 if held else 1.0), self.model
+        done = {name: torch.empty_like(value) for name, value in vars(self.pose).items()}
+
+        def solve(one: _Chunk) -> None:
+            moments = model.moments(one.rest, one.weights, noise**2, held=held)
+            target = model.target(one.rest, one.points, one.weights)
             if held:
-                target = self.model.held(target, self.model.walk(one.pose, one.rest)[0], noise**2)
-            solver, steps = self.model.solver, self.iterations
-            done.append(solver(target, moments, one.pose, iterations=steps, tolerance=still))
-        self.pose = Pose(**{name: torch.cat([vars(one)[name] for one in done]) for name in vars(self.pose)})
+                target = model.held(target, model.walk(one.pose, one.rest)[0], noise**2)
+            found = model.solver(target, moments, one.pose, iterations=self.iterations, tolerance=still)
+            for name, value in vars(found).items():
+                done[name][one.frames] = value
+
+        self._each(solve)
+        self.pose = Pose(**done)
 
     def _trusted(self) -> bool:
         """Let points count less that miss by more than noise does; whether that changed anything."""
         misses = self._distances()
-        own = trusted(misses * self.sure.sqrt(), max(self.noise, _FIRST_NOISE))
-        weights = self.sure * own
+        weights = self.sure * trusted(misses * self.sure.sqrt(), max(self.noise, _FIRST_NOISE))
         same = torch.allclose(weights, self.every, atol=_SETTLED)
         if not same:
             self.weights, self.every = weights, weights
@@ -263,7 +275,7 @@ class PointFit:
 
     def _typical(self) -> float:
         """Noise of a coordinate [m], by the median of what is left at points of the body."""
-        misses = torch.cat([self._misses(one) for one in self.chunks()]) * self.every.sqrt()[..., None]
+        misses = torch.cat(self._each(self._misses)) * self.every.sqrt()[..., None]
         there = (self.every > 0.5 * self.sure) & (self.sure > 0) & self.valid[:, None]
         if not bool(there.any()):
             return self.noise
@@ -280,13 +292,13 @@ class PointFit:
     def _distances(self) -> Tensor:
         """What points miss, (F, P) [m]."""
         # torch's norm of three numbers that lie apart takes twenty times as long
-        return torch.cat([self._misses(one).square().sum(-1).sqrt() for one in self.chunks()])
+        return torch.cat(self._each(lambda one: self._misses(one).square().sum(-1).sqrt()))
 
     def _estimate(self) -> float:
         """Noise of a coordinate [m], from what is left beside the freedom that the points take up."""
-        energy = torch.cat([
-            (one.weights[..., None] * self._misses(one).square()).sum((1, 2)) for one in self.chunks()
-        ])[self.valid]  # fmt: skip
+        energy = torch.cat(
+            self._each(lambda one: (one.weights[..., None] * self._misses(one).square()).sum((1, 2)))
+        )[self.valid]
         if not len(energy):
             return _UNKNOWN_NOISE
         some = torch.nonzero(self.valid).flatten()[:: max(1, len(energy) // _COUNTED)]
@@ -305,7 +317,8 @@ class PointFit:
     def _correct(self) -> None:
         """What twist joints and correctives do to the points, beside plain skinning."""
         layer, places = self.model.layer, self.model.places
-        for one in self.chunks():
+
+        def correct(one: _Chunk) -> None:
             plain = self._misses(one) + one.points
             scale = self.bone_scale
             posed = layer.pose(
@@ -314,14 +327,18 @@ class PointFit:
             )  # fmt: skip
             self.shift[one.frames] = places(posed.transforms, posed.vertices[:, places.vertex_ids]) - plain
 
+        self._each(correct)
+
     def _angle_std(self) -> Tensor:
         """Standard deviation (F, J - 1) [degrees] of each joint's own turn."""
         model = self.model
         every, noise = model.spread.repeat(len(self.points), 1), max(self.noise, _LEAST_CLAIM)
-        for one in self.chunks():
-            moments = model.moments(one.rest, one.weights, noise**2)
-            variance = model.variances(moments, one.pose)
+
+        def put(one: _Chunk) -> None:
+            variance = model.variances(model.moments(one.rest, one.weights, noise**2), one.pose)
             every[one.frames, model.solver.variables] = (noise * variance.clamp_min(0).sqrt()).rad2deg()
+
+        self._each(put)
         return every[:, 1:]
 
     def result(self, known: Tensor) -> PointResult:
@@ -350,8 +367,7 @@ class PointFit:
 
 def paces(model: PointModel, fps: float) -> Tensor:
     """Usual second differences (n + 1,) of the variables' turns [rad] and of the Hips [m]."""
-    pace = torch.cat((model.pace[model.solver.variables], model.pace.new_tensor([_HIPS_PACE])))
-    return pace / fps**2
+    return torch.cat((model.pace[model.solver.variables], model.pace.new_tensor([_HIPS_PACE]))) / fps**2
 
 
 def _share(fps: float) -> float:

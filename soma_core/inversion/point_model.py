@@ -245,7 +245,7 @@ class PointModel(torch.nn.Module):
 
     def points(self, rest: PointRest, turns: Tensor, places: Tensor) -> Tensor:
         """Points (F, P, 3) [m] at turns (F, J, 3, 3) and places (F, J, 3) of all joints."""
-        moved = torch.cat((turns, places[..., None]), -1)[:, self.weighted]
+        moved = torch.cat((turns[:, self.weighted], places[:, self.weighted, :, None]), -1)
         flat = moved.transpose(1, 2).flatten(2)  # (F, 3, 4 T)
         local = rest.local.flatten(2).transpose(1, 2)  # (i, 4 T, P)
         product = flat.flatten(0, 1) @ local[0] if len(local) == 1 else flat @ local

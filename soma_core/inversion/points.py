@@ -14,7 +14,7 @@ from soma_core._derived import Derived, own_precision
 from soma_core._inputs import check_bone_scale, check_choice
 from soma_core.errors import InputError
 from soma_core.inversion._inputs import check_weights, refuse_transforms
-from soma_core.inversion.point_fit import PointFit, PointResult
+from soma_core.inversion.point_fit import SEVERAL, PointFit, PointResult
 from soma_core.inversion.point_gradient import attach_point_gradient
 from soma_core.inversion.point_model import PointModel
 from soma_core.inversion.point_priors import JointPrior
@@ -24,6 +24,7 @@ from soma_core.inversion.point_views import Views
 from soma_core.inversion.result import InversionResult
 from soma_core.inversion.view_fit import ViewFit
 from soma_core.io.camera import Camera
+from soma_core.kernels._threads import side_by_side
 from soma_core.layer import Kernels, SomaLayer
 from soma_core.points.places import PointPlaces
 from soma_core.points.point_set import PointSet, load_point_set
@@ -165,15 +166,17 @@ class PointInversion(Derived):
         if not bool(known.all()):
             weights = weights * known
         clean = torch.where(known[..., None], points, 0.0)
-        fit = PointFit(
-            self.model, self.start, clean, weights, identity, bone_scale, noise=noise,
-            iterations=self.iterations,
-        )  # fmt: skip
-        fit.begin(initial)
-        fit.run()
-        if fps is not None:
-            fit.smooth(fps)
-        return self._tracked(fit.result(known), points, lambda clean: fit.lowered(clean, fps))
+        with side_by_side(count, SEVERAL, points) as threads:
+            fit = PointFit(
+                self.model, self.start, clean, weights, identity, bone_scale, noise=noise,
+                iterations=self.iterations, threads=threads,
+            )  # fmt: skip
+            fit.begin(initial)
+            fit.run()
+            if fps is not None:
+                fit.smooth(fps)
+            result = fit.result(known)
+        return self._tracked(result, points, lambda clean: fit.lowered(clean, fps))
 
     def _tracked(
         self, result: PointResult, points: Tensor, rows: Callable[[Tensor], PointRows]

@@ -6,19 +6,16 @@ operation into one SIMD instruction. On a GPU a group is one frame, and the memo
 lies abreast: their numbers at one place of it are neighbours, which one transaction reads.
 """
 
-import functools
-import os
-from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Sequence
 from types import SimpleNamespace
 
 import torch
 import warp as wp
 from torch import Tensor
 
-from soma_core.kernels._runtime import launching, loaded
+from soma_core.kernels._runtime import launching, loaded, once
 
-__all__ = ["ABREAST", "as_lanes", "as_rows", "frame_rows", "from_lanes", "in_threads", "lane_count",
+__all__ = ["ABREAST", "as_lanes", "as_rows", "frame_rows", "from_lanes", "lane_count",
            "lane_types", "launch", "row_of", "to_lanes", "worker_count", "working_rows"]  # fmt: skip
 
 _CPU_BYTES = 64
@@ -34,7 +31,7 @@ def lane_count(tensor: Tensor) -> int:
     return 1 if tensor.is_cuda else _CPU_BYTES // tensor.element_size()
 
 
-@functools.cache
+@once
 def lane_types(scalar: str, lanes: int) -> SimpleNamespace:
     """Element type ``vec`` of `lanes` numbers of type `scalar`, and lane-wise functions."""
     real = getattr(wp, scalar)
@@ -155,7 +152,7 @@ def as_rows(rows: Tensor) -> wp.array:
     return wp.from_torch(rows, requires_grad=False, return_ctype=True)
 
 
-@functools.cache
+@once
 def row_of(scalar: str) -> wp.Function:
     """Function of kernels: a group's part of :func:`working_rows`."""
     number = getattr(wp, scalar)
@@ -172,25 +169,3 @@ def launch(kernel: wp.Kernel, workers: int, inputs: Sequence, like: Tensor) -> N
     with launching(like) as device:
         block = ABREAST if like.is_cuda else 1
         wp.launch(loaded(kernel, device), dim=workers, inputs=inputs, device=device, block_dim=block)
-
-
-def in_threads(run: Callable[[slice], None], count: int, like: Tensor) -> None:
-    """Run consecutive parts of `count` groups in as many threads as torch uses.
-
-    Warp runs a CPU kernel on the calling thread and lets go of the interpreter meanwhile. On a GPU there is
-    one part.
-    """
-    if not count:
-        return
-    threads = 1 if like.is_cuda else min(torch.get_num_threads(), count)
-    parts = [slice(count * k // threads, count * (k + 1) // threads) for k in range(threads)]
-    if len(parts) == 1:
-        run(parts[0])
-        return
-    list(_pool(os.getpid(), len(parts)).map(run, parts))
-
-
-@functools.cache
-def _pool(_process: int, size: int) -> ThreadPoolExecutor:
-    """Threads that stay between launches; a forked process has its own."""
-    return ThreadPoolExecutor(size, thread_name_prefix="soma-lanes")

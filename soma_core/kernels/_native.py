@@ -8,12 +8,12 @@ A body is the text of one function. In it ``R`` is the number, ``V`` the vector 
 pointer to vectors in a group's working memory.
 """
 
-import functools
 from collections.abc import Callable
 
 import warp as wp
 
 from soma_core.kernels._lanes import ABREAST
+from soma_core.kernels._runtime import once
 
 __all__ = ["HALVES", "native", "transposing"]
 
@@ -81,7 +81,7 @@ _FUSED = """
 """Let products and sums join into one instruction, which clang otherwise leaves apart in vectors."""
 
 
-@functools.cache
+@once
 def transposing(scalar: str, lanes: int) -> tuple[wp.Function, wp.Function]:
     """Functions that bring rows of frames into lanes, and back.
 

@@ -7,23 +7,42 @@ import functools
 import logging
 import os
 import sys
-from collections.abc import Iterator
+import threading
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any
+from typing import Any, TypeVar
 
 import torch
 import warp as wp
 
 from soma_core.errors import InputError
 
-__all__ = ["as_warp", "launching", "loaded", "scalar_name", "start"]
+__all__ = ["as_warp", "launching", "loaded", "once", "scalar_name", "start"]
 
 _log = logging.getLogger(__name__)
 
 _SCALARS = {torch.float32: wp.float32, torch.float64: wp.float64}
 
 
-@functools.cache
+_Maker = TypeVar("_Maker", bound=Callable[..., Any])
+
+_making = threading.RLock()
+
+
+def once(make: _Maker) -> _Maker:
+    """Cache what a function makes; two threads never make the same: Warp builds one of equal kernels."""
+    cached = functools.cache(make)
+
+    @functools.wraps(make)
+    def made(*args: Any, **kwargs: Any) -> Any:
+        with _making:
+            return cached(*args, **kwargs)
+
+    made.cache_info = cached.cache_info  # type: ignore[attr-defined]
+    return made  # type: ignore[return-value]
+
+
+@once
 def start() -> None:
     """Initialise Warp once, without its banner or its notice that no GPU is present."""
     wp.config.quiet = True
@@ -113,7 +132,7 @@ def _load(process: int, kernel: wp.Kernel) -> None:
     _compiler(process).submit(load).result()
 
 
-@functools.cache
+@once
 def _compiler(_process: int) -> ThreadPoolExecutor:
     """The thread that compiles; a forked process has its own."""
     return ThreadPoolExecutor(1, thread_name_prefix="soma-compiler")

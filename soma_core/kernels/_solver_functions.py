@@ -13,6 +13,7 @@ from soma_core.kernels import _solver_text as text
 from soma_core.kernels import _variance_text as variance
 from soma_core.kernels import _view_text as view
 from soma_core.kernels._native import native
+from soma_core.kernels._runtime import once
 from soma_core.kernels._share_text import SHARE
 from soma_core.kernels._solver_layout import COUNTS, KEPT, LISTS, NUMBERS, SLOTS
 
@@ -31,9 +32,9 @@ _BARE = {
 
 def of_identities(factory: Callable[..., _Made]) -> Callable[..., _Made]:
     """Cache what makes kernels for one identity or for one a frame; on a GPU the same ones take both."""
-    made = functools.cache(factory)
+    made = once(factory)
 
-    @functools.cache
+    @once
     @functools.wraps(factory)
     def make(scalar: str, lanes: int, *, shared: bool) -> _Made:
         return made(scalar, lanes, shared=shared or lanes == 1)

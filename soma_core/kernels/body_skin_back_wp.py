@@ -1,16 +1,15 @@
 """Skinning of bodies in SIMD lanes, with its derivative. The twin of ``animation.skinning`` for a CPU."""
 
-import functools
-
 import torch
 import warp as wp
 from torch import Tensor
 
 from soma_core.geometry.torch_func import operator
-from soma_core.kernels._lanes import as_rows, in_threads, launch, row_of, worker_count, working_rows
+from soma_core.kernels._lanes import as_rows, launch, row_of, worker_count, working_rows
 from soma_core.kernels._native import HALVES, native, transposing
 from soma_core.kernels._residual_phases import TILE
-from soma_core.kernels._runtime import as_warp, scalar_name
+from soma_core.kernels._runtime import as_warp, once, scalar_name
+from soma_core.kernels._threads import in_threads
 from soma_core.kernels.body_skin_wp import Blend, Strides, drawing, lanes_of, skin_bodies, strides_of
 
 __all__ = ["skin"]
@@ -33,7 +32,7 @@ class _Task:
     points: int
 
 
-@functools.cache
+@once
 def _kernel(scalar: str, lanes: int):
     width, size = lanes, TILE
     real, rows = wp.array(dtype=getattr(wp, scalar)), wp.array3d(dtype=getattr(wp, scalar))

@@ -4,7 +4,6 @@ Tile by tile of vertices: rest points, brought to the bind pose where asked for,
 skinning. Nothing but posed vertices is written. The twin of ``animation.skinning`` for a CPU.
 """
 
-import functools
 from typing import NamedTuple
 
 import scipy.sparse
@@ -12,10 +11,11 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from soma_core.kernels._lanes import as_rows, in_threads, launch, row_of, worker_count, working_rows
+from soma_core.kernels._lanes import as_rows, launch, row_of, worker_count, working_rows
 from soma_core.kernels._native import HALVES, native, transposing
 from soma_core.kernels._residual_phases import OFFSET, TILE
-from soma_core.kernels._runtime import as_warp, scalar_name
+from soma_core.kernels._runtime import as_warp, once, scalar_name
+from soma_core.kernels._threads import in_threads
 from soma_core.kernels._view_text import TANH
 
 __all__ = ["Added", "Blend", "Strides", "blend_of", "drawing", "lanes_of", "skin_bodies", "strides_of"]
@@ -93,7 +93,7 @@ class Strides:
     axis: wp.int64
 
 
-@functools.cache
+@once
 def _kernel(scalar: str, lanes: int):
     width, size = lanes, TILE
     real, rows = wp.array(dtype=getattr(wp, scalar)), wp.array3d(dtype=getattr(wp, scalar))
@@ -141,7 +141,7 @@ def _kernel(scalar: str, lanes: int):
     return run
 
 
-@functools.cache
+@once
 def drawing(scalar: str, lanes: int) -> wp.Function:
     """Function that brings vertices begin .. stop of bodies, however they lie, into a tile."""
     real = wp.array(dtype=getattr(wp, scalar))

@@ -5,7 +5,6 @@ many steps at once, and nothing returns to Python between them. A step that woul
 again shorter, where the twin damps the frame's matrix anew.
 """
 
-import functools
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
@@ -14,11 +13,12 @@ import warp as wp
 from torch import Tensor
 
 from soma_core.kernels._descent_text import MEMORY
-from soma_core.kernels._lanes import as_rows, in_threads, lane_count, launch, row_of, working_rows
+from soma_core.kernels._lanes import as_rows, lane_count, launch, row_of, working_rows
 from soma_core.kernels._native import transposing
 from soma_core.kernels._residual_phases import TILE, phases, tile_slots
-from soma_core.kernels._runtime import as_warp, scalar_name
+from soma_core.kernels._runtime import as_warp, once, scalar_name
 from soma_core.kernels._solver_functions import Task, descent_functions, solver_functions
+from soma_core.kernels._threads import in_threads
 from soma_core.kernels.model_residual_wp import Compared, gathering, skinning
 from soma_core.kernels.pose_solver_wp import PoseSolver
 
@@ -173,7 +173,7 @@ def _stepping(scalar: str, width: int, *, shared: bool):
     return take, draw
 
 
-@functools.cache
+@once
 def _kernel(scalar: str, width: int, *, shared: bool):
     number = getattr(wp, scalar)
     real, rows = wp.array(dtype=number), wp.array3d(dtype=number)

@@ -9,21 +9,21 @@ from torch import Tensor
 from soma_core.kernels._lanes import (
     as_lanes,
     from_lanes,
-    in_threads,
     lane_count,
     lane_types,
     launch,
     to_lanes,
     worker_count,
 )
-from soma_core.kernels._runtime import as_warp, scalar_name
+from soma_core.kernels._runtime import as_warp, once, scalar_name
+from soma_core.kernels._threads import in_threads
 
 __all__ = ["frame_moments"]
 
 _ids = wp.array(dtype=wp.int64)
 
 
-@functools.cache
+@once
 def _kernel(scalar: str, lanes: int):
     types = lane_types(scalar, lanes)
     real, frames = types.real, wp.array2d(dtype=types.vec)

@@ -5,17 +5,15 @@ activations of the correctives. The second has a block for each patch of skin an
 read once for the group, and rest shapes are moved by the correctives on the way to the skin.
 """
 
-import functools
-
 import warp as wp
 from torch import Tensor
 
 from soma_core.geometry.torch_func import operator
-from soma_core.kernels._lanes import in_threads
 from soma_core.kernels._native import native
 from soma_core.kernels._patch_text import patch_text
 from soma_core.kernels._posing_text import body_text
-from soma_core.kernels._runtime import as_warp, launching, loaded, scalar_name
+from soma_core.kernels._runtime import as_warp, launching, loaded, once, scalar_name
+from soma_core.kernels._threads import in_threads
 
 __all__ = ["pose_bodies", "skin_patches"]
 
@@ -30,7 +28,7 @@ _WORDS = {"float32": 4, "float64": 2}
 _ints, _shorts = wp.array(dtype=wp.int32), wp.array(dtype=wp.int16)
 
 
-@functools.cache
+@once
 def _body_kernel(scalar: str) -> wp.Kernel:
     numbers = wp.array(dtype=getattr(wp, scalar))
 
@@ -60,7 +58,7 @@ def _body_kernel(scalar: str) -> wp.Kernel:
     return bodies
 
 
-@functools.cache
+@once
 def _patch_kernel(scalar: str, *, single: bool) -> wp.Kernel:
     numbers = wp.array(dtype=getattr(wp, scalar))
     group = 1 if single else _GROUP[scalar]

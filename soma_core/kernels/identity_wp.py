@@ -3,14 +3,13 @@
 On CUDA, dozens of products of 3x3 matrices would each be a launch of their own.
 """
 
-import functools
 from types import SimpleNamespace
 
 import warp as wp
 from torch import Tensor
 
 from soma_core.geometry.torch_func import operator
-from soma_core.kernels._runtime import as_warp, launching, loaded, scalar_name
+from soma_core.kernels._runtime import as_warp, launching, loaded, once, scalar_name
 
 __all__ = ["fitted_world", "to_bind_pose"]
 
@@ -47,7 +46,7 @@ def _functions(scalar: str, module: wp.Module) -> tuple[wp.Function, wp.Function
     return joined, turn_of, place_of
 
 
-@functools.cache
+@once
 def _kernels(scalar: str) -> SimpleNamespace:
     real = getattr(wp, scalar)
     vec3, mat33 = wp.types.vector(3, real), wp.types.matrix((3, 3), real)

@@ -1,6 +1,5 @@
 """Forward kinematics in Warp: the twin of ``animation.kinematics``; one thread walks one body's tree."""
 
-import functools
 from types import SimpleNamespace
 
 import torch
@@ -8,12 +7,12 @@ import warp as wp
 from torch import Tensor
 
 from soma_core.geometry.torch_func import operator
-from soma_core.kernels._runtime import as_warp, launching, loaded, scalar_name
+from soma_core.kernels._runtime import as_warp, launching, loaded, once, scalar_name
 
 __all__ = ["forward_kinematics"]
 
 
-@functools.cache
+@once
 def _kernels(scalar: str) -> SimpleNamespace:
     real = getattr(wp, scalar)
     vec3, mat33 = wp.types.vector(3, real), wp.types.matrix((3, 3), real)

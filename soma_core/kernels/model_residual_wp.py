@@ -15,7 +15,6 @@ from torch import Tensor
 
 from soma_core.kernels._lanes import (
     as_rows,
-    in_threads,
     lane_count,
     launch,
     row_of,
@@ -24,7 +23,8 @@ from soma_core.kernels._lanes import (
 )
 from soma_core.kernels._native import transposing
 from soma_core.kernels._residual_phases import TILE, phases, tile_slots
-from soma_core.kernels._runtime import as_warp, scalar_name
+from soma_core.kernels._runtime import as_warp, once, scalar_name
+from soma_core.kernels._threads import in_threads
 
 __all__ = ["Compared", "gathering", "residual_sums", "residual_tables", "skinning"]
 
@@ -53,7 +53,7 @@ class Compared:
     measured: int
 
 
-@functools.cache
+@once
 def _kernel(scalar: str, lanes: int):
     width, size, at_length = lanes, TILE, tile_slots().length
     real, rows = wp.array(dtype=getattr(wp, scalar)), wp.array3d(dtype=getattr(wp, scalar))

@@ -1,6 +1,5 @@
 """Nearest rotations in Warp: twin of ``rotation_from_covariance`` in ``geometry.kabsch``, forward only."""
 
-import functools
 import math
 
 import torch
@@ -10,7 +9,6 @@ from torch import Tensor
 from soma_core.geometry.kabsch import PRIOR_STRENGTH
 from soma_core.kernels._lanes import (
     as_rows,
-    in_threads,
     lane_count,
     launch,
     row_of,
@@ -18,7 +16,8 @@ from soma_core.kernels._lanes import (
     working_rows,
 )
 from soma_core.kernels._native import native, transposing
-from soma_core.kernels._runtime import as_warp, scalar_name
+from soma_core.kernels._runtime import as_warp, once, scalar_name
+from soma_core.kernels._threads import in_threads
 
 __all__ = ["NEWTON_STEPS", "nearest_functions", "nearest_rotation"]
 
@@ -29,7 +28,7 @@ _FLOORS = {"float32": (1e-24, 1e-30, 1e-30), "float64": (math.ulp(0.0) ** 0.5, 1
 """Of the squared covariance, its Gram matrix's spread and its largest singular value: the reference's."""
 
 
-@functools.cache
+@once
 def _kernel(scalar: str, lanes: int):
     width, number, steps = lanes, getattr(wp, scalar), NEWTON_STEPS
     real, rows = wp.array(dtype=number), wp.array3d(dtype=number)
@@ -52,7 +51,7 @@ def _kernel(scalar: str, lanes: int):
     return nearest
 
 
-@functools.cache
+@once
 def nearest_functions(scalar: str, lanes: int) -> tuple[wp.Function, wp.Function, wp.Function]:
     """Functions that turn a covariance into its rotation: before, of and after the Newton steps."""
     real = wp.array(dtype=getattr(wp, scalar))

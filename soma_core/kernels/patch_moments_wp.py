@@ -5,8 +5,6 @@ shared memory and sums them by lists of its influences, as ``patch_residual_wp``
 adds up the patches.
 """
 
-import functools
-
 import numpy as np
 import torch
 import warp as wp
@@ -15,7 +13,7 @@ from torch import Tensor
 from soma_core.kernels._native import native
 from soma_core.kernels._patch_text import PATCH_VERTICES
 from soma_core.kernels._posing_text import THREADS
-from soma_core.kernels._runtime import as_warp, launching, loaded, scalar_name
+from soma_core.kernels._runtime import as_warp, launching, loaded, once, scalar_name
 from soma_core.kernels.residual_patches import joint_lists
 
 __all__ = ["MomentPatches", "moments_by_patches"]
@@ -68,7 +66,7 @@ class MomentPatches(torch.nn.Module):
             self.register_buffer(name, torch.as_tensor(array).to(device, kind), persistent=False)
 
 
-@functools.cache
+@once
 def _kernel(scalar: str, *, single: bool) -> wp.Kernel:
     numbers = wp.array(dtype=getattr(wp, scalar))
     group = 1 if single else _GROUP[scalar]
@@ -137,7 +135,7 @@ _MOMENTS = """
 """
 
 
-@functools.cache
+@once
 def _totals(scalar: str) -> wp.Kernel:
     number = getattr(wp, scalar)
     numbers = wp.array(dtype=number)

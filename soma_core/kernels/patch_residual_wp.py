@@ -15,7 +15,7 @@ from torch import Tensor
 from soma_core.kernels._native import native
 from soma_core.kernels._patch_residual_text import FLAGS, patch_residual_text
 from soma_core.kernels._patch_text import PATCH_VERTICES
-from soma_core.kernels._runtime import as_warp, launching, loaded, scalar_name
+from soma_core.kernels._runtime import as_warp, launching, loaded, once, scalar_name
 from soma_core.kernels.residual_patches import ResidualPatches
 
 __all__ = ["residual_by_patches"]
@@ -34,7 +34,7 @@ _SCRATCH = 2**28
 _ints, _shorts = wp.array(dtype=wp.int32), wp.array(dtype=wp.int16)
 
 
-@functools.cache
+@once
 def _kernel(scalar: str, *, single: bool) -> wp.Kernel:
     numbers = wp.array(dtype=getattr(wp, scalar))
     group = 1 if single else _GROUP[scalar]
@@ -70,7 +70,7 @@ def _kernel(scalar: str, *, single: bool) -> wp.Kernel:
     return patch_residual
 
 
-@functools.cache
+@once
 def _totals(scalar: str) -> wp.Kernel:
     number = getattr(wp, scalar)
     numbers = wp.array(dtype=number)

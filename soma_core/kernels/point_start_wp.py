@@ -1,13 +1,10 @@
 """Bone after bone turned to points in Warp: twin of the loop in ``PointStart``, of one identity."""
 
-import functools
-
 import warp as wp
 from torch import Tensor
 
 from soma_core.kernels._lanes import (
     as_rows,
-    in_threads,
     lane_count,
     launch,
     row_of,
@@ -15,7 +12,8 @@ from soma_core.kernels._lanes import (
     working_rows,
 )
 from soma_core.kernels._native import native, transposing
-from soma_core.kernels._runtime import as_warp, scalar_name
+from soma_core.kernels._runtime import as_warp, once, scalar_name
+from soma_core.kernels._threads import in_threads
 from soma_core.kernels.nearest_rotation_wp import NEWTON_STEPS, nearest_functions
 
 __all__ = ["begun"]
@@ -111,7 +109,7 @@ _SETTLE = """
 """
 
 
-@functools.cache
+@once
 def _kernel(scalar: str, lanes: int):
     width, number, newton = lanes, getattr(wp, scalar), NEWTON_STEPS
     real, rows = wp.array(dtype=number), wp.array3d(dtype=number)

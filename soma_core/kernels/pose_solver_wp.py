@@ -16,7 +16,6 @@ from torch import Tensor
 from soma_core.kernels._lanes import (
     as_rows,
     frame_rows,
-    in_threads,
     lane_count,
     launch,
     row_of,
@@ -27,6 +26,7 @@ from soma_core.kernels._native import transposing
 from soma_core.kernels._runtime import as_warp, scalar_name
 from soma_core.kernels._solver_functions import Task, of_identities, solver_functions
 from soma_core.kernels._solver_layout import COUNTS, EXTRA, LISTS, NUMBERS, slot_sizes
+from soma_core.kernels._threads import in_threads
 from soma_core.kernels.pose_steps_wp import factor_kernel, solution_kernels, step_kernels, tree_kernels
 
 __all__ = ["Factor", "PoseSolver", "Soft"]

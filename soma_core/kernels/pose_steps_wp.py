@@ -1,12 +1,12 @@
 """Single steps of the pose solver in Warp: the tree, slopes, the whole model's matrix, and what it solves."""
 
-import functools
 from types import SimpleNamespace
 
 import warp as wp
 
 from soma_core.kernels._lanes import row_of
 from soma_core.kernels._native import transposing
+from soma_core.kernels._runtime import once
 from soma_core.kernels._solver_functions import Task, of_identities, solver_functions
 
 __all__ = ["factor_kernel", "solution_kernels", "step_kernels", "tree_kernels"]
@@ -181,7 +181,7 @@ def factor_kernel(scalar: str, lanes: int, *, shared: bool):
     return factorise
 
 
-@functools.cache
+@once
 def solution_kernels(scalar: str, lanes: int) -> SimpleNamespace:
     """What a factorised matrix is asked for: solutions, and the variables' variances."""
     number = getattr(wp, scalar)

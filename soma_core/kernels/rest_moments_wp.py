@@ -3,20 +3,18 @@
 The four entries of a point ``(b; 1)`` are the lanes of one vector.
 """
 
-import functools
-
 import warp as wp
 from torch import Tensor
 
 from soma_core.kernels._native import native
-from soma_core.kernels._runtime import as_warp, launching, loaded, scalar_name
+from soma_core.kernels._runtime import as_warp, launching, loaded, once, scalar_name
 
 __all__ = ["rest_moments"]
 
 _ids = wp.array(dtype=wp.int64)
 
 
-@functools.cache
+@once
 def _kernel(scalar: str, lanes: int):
     real = wp.array(dtype=getattr(wp, scalar))
     place, couple = _bodies(real, scalar, lanes)

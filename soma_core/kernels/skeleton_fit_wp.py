@@ -5,7 +5,6 @@ with the loops over children unrolled, the generated adjoint of 25 pairs takes h
 CUDA.
 """
 
-import functools
 from types import SimpleNamespace
 
 import torch
@@ -14,7 +13,7 @@ from torch import Tensor
 
 from soma_core.geometry.kabsch import PRIOR_STRENGTH
 from soma_core.geometry.torch_func import operator
-from soma_core.kernels._runtime import as_warp, launching, loaded, scalar_name
+from soma_core.kernels._runtime import as_warp, launching, loaded, once, scalar_name
 from soma_core.kernels.rotation_functions_wp import bone_functions, kabsch_function
 
 __all__ = ["fit_displacements"]
@@ -22,7 +21,7 @@ __all__ = ["fit_displacements"]
 _ids, _table = wp.array(dtype=wp.int64), wp.array2d(dtype=wp.int64)
 
 
-@functools.cache
+@once
 def _displace(scalar: str) -> wp.Kernel:
     module = wp.get_module(f"soma_skeleton_fit_{scalar}")
     types = _types(scalar)
@@ -53,7 +52,7 @@ def _forward(types: SimpleNamespace, module: wp.Module) -> tuple[wp.Function, wp
     return kabsch_function(types.scalar, module), arc, _fan_covariance(types, module, pair_normal)
 
 
-@functools.cache
+@once
 def _types(scalar: str) -> SimpleNamespace:
     real = getattr(wp, scalar)
     return SimpleNamespace(
@@ -87,7 +86,7 @@ def _fan_covariance(types: SimpleNamespace, module: wp.Module, pair_normal: wp.F
     return fan_covariance
 
 
-@functools.cache
+@once
 def _pull_back(scalar: str) -> wp.Kernel:
     """Kernel of the derivative of ``displace``: gradients of joints are added, those of covariances set.
 

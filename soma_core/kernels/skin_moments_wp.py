@@ -9,7 +9,6 @@ from torch import Tensor
 
 from soma_core.kernels._lanes import (
     as_rows,
-    in_threads,
     lane_count,
     launch,
     row_of,
@@ -17,7 +16,8 @@ from soma_core.kernels._lanes import (
     working_rows,
 )
 from soma_core.kernels._native import native, transposing
-from soma_core.kernels._runtime import as_warp, scalar_name
+from soma_core.kernels._runtime import as_warp, once, scalar_name
+from soma_core.kernels._threads import in_threads
 
 __all__ = ["target_moments", "tile_runs"]
 
@@ -27,7 +27,7 @@ _TILE = 64
 _ids = wp.array(dtype=wp.int64)
 
 
-@functools.cache
+@once
 def _kernel(scalar: str, lanes: int):
     width, size = lanes, _TILE
     real, rows = wp.array(dtype=getattr(wp, scalar)), wp.array3d(dtype=getattr(wp, scalar))

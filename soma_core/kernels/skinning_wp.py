@@ -1,6 +1,5 @@
 """Linear blend skinning in Warp: the twin of ``animation.skinning``."""
 
-import functools
 from types import SimpleNamespace
 
 import torch
@@ -9,12 +8,12 @@ from torch import Tensor
 
 from soma_core.geometry.sparse import Csr
 from soma_core.geometry.torch_func import operator
-from soma_core.kernels._runtime import as_warp, launching, loaded, scalar_name
+from soma_core.kernels._runtime import as_warp, launching, loaded, once, scalar_name
 
 __all__ = ["skin"]
 
 
-@functools.cache
+@once
 def _kernels(scalar: str) -> SimpleNamespace:
     real = getattr(wp, scalar)
     vec3, vec4 = wp.types.vector(3, real), wp.types.vector(4, real)

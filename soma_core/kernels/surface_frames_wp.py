@@ -1,18 +1,16 @@
 """Smooth local rotations of a skinned surface in Warp: the twin of ``correctives.frames``."""
 
-import functools
-
 import torch
 import warp as wp
 from torch import Tensor
 
-from soma_core.kernels._runtime import as_warp, launching, loaded, scalar_name
+from soma_core.kernels._runtime import as_warp, launching, loaded, once, scalar_name
 from soma_core.kernels.rotation_functions_wp import kabsch_function
 
 __all__ = ["surface_frames"]
 
 
-@functools.cache
+@once
 def _kernel(scalar: str) -> tuple[wp.Kernel, type, type, type]:
     real = getattr(wp, scalar)
     vec3, vec4 = wp.types.vector(3, real), wp.types.vector(4, real)

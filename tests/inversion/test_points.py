@@ -103,6 +103,21 @@ def test_gaps_weights_and_single_frames_change_no_other() -> None:
     assert (inversion(wild, IDENTITY, weights=weights).point_error[:, :7]).max() < 1e-3
 
 
+def test_two_threads_find_what_one_finds() -> None:
+    """To the bit, where frames are shared out between them."""
+    inversion, many = PointInversion(LAYER, "smpl22"), 2 * point_fit.SEVERAL + 19
+    points = LAYER.points(LAYER.joints(IDENTITY, _poses(many)), "smpl22")
+    points = points + 0.01 * randn(*points.shape, seed=3).float()
+    before, found = torch.get_num_threads(), []
+    for count in (1, 2):
+        torch.set_num_threads(count)
+        found.append(inversion(points, IDENTITY))
+    torch.set_num_threads(before)
+    for name, value in vars(found[0]).items():
+        theirs = getattr(found[1], name)
+        assert torch.equal(value, theirs) if isinstance(value, Tensor) else value == theirs, name
+
+
 def test_what_points_leave_open_is_as_expected() -> None:
     expected = JointRange(rest=(20.0, 0.0, 0.0), spread=(5.0, 5.0))
     prior = JointPrior(ranges={**JointPrior().ranges, "LeftHand": expected})

@@ -1,0 +1,98 @@
+"""Work side by side in threads: parts of a kernel's launch, and parts of a computation of many operations."""
+
+import contextlib
+import functools
+import os
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from typing import TypeVar
+
+import torch
+from torch import Tensor
+
+__all__ = ["in_parts", "in_threads", "side_by_side"]
+
+_own = threading.local()
+
+_Part, _Made = TypeVar("_Part"), TypeVar("_Made")
+
+
+def in_threads(run: Callable[[slice], None], count: int, like: Tensor) -> None:
+    """Run consecutive parts of `count` groups in as many threads as torch uses.
+
+    Warp runs a CPU kernel on the calling thread and lets go of the interpreter meanwhile. On a GPU there is
+    one part.
+    """
+    if not count:
+        return
+    threads = 1 if like.is_cuda or hasattr(_own, "beside") else min(torch.get_num_threads(), count)
+    parts = [slice(count * k // threads, count * (k + 1) // threads) for k in range(threads)]
+    if len(parts) == 1:
+        run(parts[0])
+        return
+    list(_pool(os.getpid(), len(parts)).map(run, parts))
+
+
+def in_parts(run: Callable[[_Part], _Made], parts: Sequence[_Part], threads: int) -> list[_Made]:
+    """What `run` makes of each part, side by side in threads in which torch and kernels have one each."""
+    if min(threads, len(parts)) < 2 or hasattr(_own, "beside"):
+        return [run(part) for part in parts]
+    inference, graded = torch.is_inference_mode_enabled(), torch.is_grad_enabled()
+
+    def alone(part: _Part) -> _Made:
+        with torch.inference_mode(inference), torch.set_grad_enabled(graded):
+            return run(part)
+
+    return list(_pool(os.getpid(), threads).map(alone, parts))
+
+
+@contextlib.contextmanager
+def side_by_side(count: int, least: int, like: Tensor) -> Iterator[int]:
+    """How many threads are for :func:`in_parts` of at least so many of `count` items; torch has one here.
+
+    An operation of torch in several threads lets them wait awake, in the way of those of the next parts.
+    There is one, and torch goes on as it did, where items are few or on a GPU.
+    """
+    before = torch.get_num_threads()
+    threads = min(before, count // least)
+    if threads < 2 or like.is_cuda or not torch.backends.openmp.is_available():
+        yield 1
+        return
+    _have(1)
+    try:
+        yield threads
+    finally:
+        _have(before)
+
+
+@functools.cache
+def _pool(_process: int, size: int) -> ThreadPoolExecutor:
+    """Threads that stay between launches; a forked process has its own."""
+    return ThreadPoolExecutor(size, thread_name_prefix="soma-lanes", initializer=_belong)
+
+
+def _belong() -> None:
+    """Make this thread one that works beside others, and starts none."""
+    _own.beside = True
+    _have(1)
+
+
+@functools.cache
+def _turn(_process: int) -> threading.Lock:
+    return threading.Lock()
+
+
+def _have(count: int) -> None:
+    """Give torch so many threads in this one, and leave what threads to come begin with as it is."""
+    torch.get_num_threads()  # a thread that asks for the first time takes what new ones begin with
+    with _turn(os.getpid()):
+        begun = _apart(torch.get_num_threads)
+        torch.set_num_threads(count)
+        _apart(torch.set_num_threads, begun)
+
+
+def _apart(run: Callable[..., _Made], *args: object) -> _Made:
+    """What a new thread makes of this."""
+    with ThreadPoolExecutor(1) as one:
+        return one.submit(run, *args).result()
