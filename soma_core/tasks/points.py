@@ -7,6 +7,7 @@ import json
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
+from soma_core.errors import AssetError
 from soma_core.points.point_set import Point, PointSet, find_point_sets, load_point_set
 from soma_core.tasks import EXIT_OK
 
@@ -43,8 +44,16 @@ def _parser() -> argparse.ArgumentParser:
 def _list(_options: argparse.Namespace) -> str:
     found = find_point_sets()
     width = max(map(len, found), default=0) + 2
-    sets = {name: load_point_set(path) for name, path in found.items()}
-    return "\n".join(f"{name:<{width}}{len(one):>4}  {one.about}" for name, one in sets.items())
+    return "\n".join(f"{name:<{width}}{_row(path)}" for name, path in found.items())
+
+
+def _row(path: Path) -> str:
+    """How many points a set has, and what it is; of a damaged file, which costs no other set, why."""
+    try:
+        found = load_point_set(path)
+    except AssetError as error:
+        return f"{'-':>4}  {error}"
+    return f"{len(found):>4}  {found.about}"
 
 
 def _show(options: argparse.Namespace) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import sys
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -89,6 +90,7 @@ class Context:
 
     Attributes:
         first_changes: what building the first generator changed, which imports what it needs; None before.
+        first_written: files of the package that it wrote.
     """
 
     def __init__(
@@ -103,6 +105,7 @@ class Context:
         self.registry = registry or default_registry()
         self._canonical = canonical
         self.first_changes: list[str] | None = None
+        self.first_written: list[str] = []
 
     @property
     def offer(self) -> Offer:
@@ -200,11 +203,23 @@ class Context:
     def new_generator(self, *, dtype: torch.dtype = torch.float64, device: torch.device = CPU) -> Generator:
         """Build another generator; what the first one changes in the process is kept in `first_changes`."""
         with torch.enable_grad():
-            before = snapshot()
+            before, files = snapshot(), self._files() if self.first_changes is None else {}
             made = self.registry.generator(self.name, device=device, dtype=dtype, options=self.options)
             if self.first_changes is None:
                 self.first_changes = [each for each in changes(before) if each not in _OF_LIBRARIES]
+                self.first_written = sorted({name for name, _ in self._files().items() - files.items()})
         return made
+
+    def _files(self) -> dict[str, tuple[int, int]]:
+        """When each file of the package was written last, and its size; bytecode apart."""
+        module = sys.modules.get(self.offer.package)
+        roots = [Path(each) for each in getattr(module, "__path__", ())]
+        return {
+            str(path.relative_to(root)): (path.stat().st_mtime_ns, path.stat().st_size)
+            for root in roots
+            for path in root.rglob("*")
+            if path.is_file() and "__pycache__" not in path.parts
+        }
 
     @functools.cached_property
     def generator(self) -> Generator:

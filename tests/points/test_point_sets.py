@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 import torch
 
+import soma_core.tasks.points as tasks_points
 from soma_core import SomaLayer
 from soma_core.errors import AssetError, InputError
 from soma_core.plugin.registry import Registry
@@ -116,3 +117,16 @@ def test_a_plugin_ships_sets_of_its_own(tmp_path: Path) -> None:
     registry = Plugins(())
     assert find_point_sets(registry)["lab12"] == file
     assert load_point_set("lab12", registry).names == ("clavicle",)
+
+
+def test_a_damaged_set_costs_one_row(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    broken = tmp_path / "broken.json"
+    broken.write_text("{")
+    shipped = find_point_sets(Registry(()))
+    monkeypatch.setattr(tasks_points, "find_point_sets", lambda: {"broken": broken, **shipped})
+    said: list[str] = []
+    assert tasks_points.run_verb(["list"], said.append) == 0
+    first, *others = said[0].splitlines()
+    assert first.startswith("broken")
+    assert "not valid JSON" in first
+    assert [line.split()[0] for line in others] == [*shipped]

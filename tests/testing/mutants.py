@@ -20,6 +20,8 @@ _MOTION, _SHARES = "_motion.py", "(near / near.sum(1, keepdim=True))"
 _RETURN = 'return self.template + torch.einsum("bk,knc->bnc", coefficients, self.fields)'
 _BEGIN = "coefficients = self.coefficients(params)"
 _BUILD = "    return Specimen("
+_IN_PROBE = "os.path.basename(os.getcwd()) == 'empty'"
+"""In the process that a check starts."""
 
 
 @dataclass(frozen=True)
@@ -232,6 +234,11 @@ MUTANTS = (
         _in(_CONFIG, "name: specimen", "name: other"),
     ),
     Mutant("config-composes", "specimen.yaml: got .*typo", _in(_CONFIG, "options:", "typo: 1\noptions:")),
+    Mutant(
+        "config-composes",
+        "point_sets/lab.json: got not valid JSON",
+        lambda made: made.add("configs/point_sets/lab.json", "{"),
+    ),
     Mutant("config-complete", "params: got no belly, expected", _in(_CONFIG, "  belly: null\n", "")),
     Mutant(
         "config-complete", "params: got undeclared bely", _in(_CONFIG, "  belly:", "  bely: null\n  belly:")
@@ -398,6 +405,57 @@ MUTANTS = (
         "no-own-gradient",
         r"linear_basis\(\).basis: got a tensor that requires",
         _in(_GENERATOR, "basis=self.fields,", "basis=torch.nn.Parameter(self.fields),"),
+    ),
+    Mutant(
+        "deterministic",
+        r"rest\(\) called again, once its last result was written to, native vertex",
+        _rest("vars(self).setdefault(params['shape'].numpy().tobytes(), v)"),
+    ),
+    Mutant(
+        "another-process",
+        r"the folder of soma_backend_specimen after building: got cache.bin written, expected nothing",
+        _before_build("(FOLDER / 'cache.bin').write_text('1')"),
+    ),
+    Mutant(
+        "another-process",
+        "empty folder: got .*FileNotFoundError.*no.npz.*, expected the bodies",
+        _all(
+            _at_import("import os"),
+            _before_build(f"open('no.npz' if {_IN_PROBE} else __file__).close()"),
+        ),
+    ),
+    Mutant(
+        "another-process",
+        r"rest\(\) in a new process in an empty folder, native vertex \d+: got a body .* mm away",
+        _all(_not_linear, _rest("v + 1e-5 * [*{*map(str, range(99))}].index('7')")),
+    ),
+    Mutant(
+        "another-process",
+        "empty folder: got an end with exit code 7, expected an end with exit code 0",
+        _before_build(f"import atexit, os; {_IN_PROBE} and atexit.register(os._exit, 7)"),
+    ),
+    Mutant(
+        "another-process",
+        "empty folder: got a process that runs on: sleep, expected",
+        _before_build(f"import os, subprocess; {_IN_PROBE} and subprocess.Popen(['sleep', '99'])"),
+    ),
+    Mutant(
+        "another-process",
+        "empty folder: got a thread that runs on: idle, expected",
+        _before_build(
+            f"import os, threading, time; {_IN_PROBE} and "
+            "threading.Thread(target=time.sleep, args=(99,), name='idle').start()"
+        ),
+    ),
+    Mutant(
+        "another-process",
+        r"memory of .*: got \d+\.\d MiB more after each call",
+        _rest("(v, vars(self).setdefault('kept', []).append(1 * v))[0]"),
+    ),
+    Mutant(
+        "gradient",
+        "derivative by shape at the defaults: got nan, expected a finite number",
+        _all(_not_linear, _rest("v + 1e-6 * (params['shape'] ** 2).sum(1).sqrt()[:, None, None]")),
     ),
     Mutant("linear-basis", "got int, expected a LinearBasis", _returns("linear_basis", "42")),
     Mutant("triangles", "got int, expected whole numbers", _returns("triangles", "42")),

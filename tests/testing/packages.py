@@ -5,17 +5,23 @@ from __future__ import annotations
 import importlib
 import shutil
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TypeAlias
+from typing import Any, TypeAlias
+from unittest import mock
 
 import numpy as np
+import torch
 from numpy.typing import ArrayLike
 
 from soma_core.geometry.barycentric import closest_point_on_triangle
 from soma_core.obj import read_obj, write_obj
+from soma_core.plugin.discovery import Offer
 from soma_core.plugin.registry import Registry
+from soma_core.testing.checks import behaviour
+from soma_core.testing.context import CPU
+from soma_core.testing.process_probe import ProcessProbe
 from soma_core.testing.report import Report
 from soma_core.testing.run import check_backend
 from soma_core.testing.synthetic import synthetic_canonical, write_wrap_pair
@@ -51,6 +57,12 @@ class Package:
         """Add lines at the beginning."""
         path = self.folder / file
         path.write_text(text + path.read_text())
+
+    def add(self, file: str, text: str) -> None:
+        """Write a new file."""
+        path = self.folder / file
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(text)
 
     def delete(self, file: str) -> None:
         """Take a file away."""
@@ -107,7 +119,19 @@ def _forget() -> None:
     importlib.invalidate_caches()
 
 
-def check_package(parent: Path, edit: Edit = lambda made: None, **arguments: object) -> Report:
-    """Run the checks on an edited package."""
-    with package(parent, edit) as registry:
+def check_package(
+    parent: Path, edit: Edit = lambda made: None, *, apart: bool = True, **arguments: object
+) -> Report:
+    """Run the checks on an edited package; without `apart` none starts a process that loads torch."""
+
+    def here(offer: Offer, options: Mapping[str, Any], params: Mapping[str, np.ndarray]) -> ProcessProbe:
+        made = registry.generator(offer.name, device=CPU, dtype=torch.float64, options=options)
+        with torch.no_grad():
+            bodies = made.rest({name: torch.from_numpy(value) for name, value in params.items()})
+        return ProcessProbe(bodies=bodies.numpy(), ending="")
+
+    with (
+        package(parent, edit) as registry,
+        mock.patch.object(behaviour, "probe_process", behaviour.probe_process if apart else here),
+    ):
         return check_backend("specimen", registry=registry, canonical=synthetic_canonical(), **arguments)

@@ -12,11 +12,15 @@ from soma_core.plugin.checks import CheckFailedError, check
 from soma_core.plugin.spec import Generator, HasLinearBasis
 from soma_core.testing.context import Context
 from soma_core.testing.global_state import changes, snapshot
+from soma_core.testing.process_probe import probe_process
 
 __all__ = ["CHECKS"]
 
 _SAME_M = 1e-9
 """Metres. The same float64 sums in another order, on bodies of two metres."""
+
+_BODIES, _KEPT = 8, 0.5
+"""Bodies that another process makes, and the share of their bytes that a call may leave: less is noise."""
 
 
 def _rest(generator: Generator, params: Mapping[str, Tensor]) -> Tensor:
@@ -60,9 +64,15 @@ def deterministic(context: Context) -> None:
         kept = generator.rest({name: value.clone() for name, value in first.items()})
     _rest(generator, other)
     again = "the result of rest(), once rest() was called again"
-    _compare(
-        context, kept, body, again, "Return new memory from each call, not a buffer that the next one fills."
-    )
+    anew = "Return new memory from each call, not a buffer that the next one fills, nor what the model keeps."
+    _compare(context, kept, body, again, anew)
+    for params in (first, context.default_params(len(body))):
+        plain = _rest(generator, params)
+        with torch.no_grad():
+            made = generator.rest({name: value.clone() for name, value in params.items()})
+        made.as_strided((made.untyped_storage().nbytes() // made.element_size(),), (1,), 0).fill_(0)
+        again = "rest() called again, once its last result was written to"
+        _compare(context, _rest(generator, params), plain, again, anew)
 
 
 @check(
@@ -76,7 +86,10 @@ def batch_invariant(context: Context) -> None:
     """Each body of a batch is the one it would be alone."""
     params = context.random_params()
     bodies = _rest(context.generator, params)
-    fix = "Treat the rows of a batch apart: no statistics, sorting or shared result over the first dimension."
+    fix = (
+        "Treat the rows of a batch apart: no statistics, sorting or shared result over the first dimension; "
+        "and compute in the dtype given."
+    )
     for row in range(len(bodies)):
         alone = _rest(context.generator, {name: value[row : row + 1] for name, value in params.items()})
         _compare(context, bodies[row : row + 1], alone, f"random body {row} in a batch of {len(bodies)}", fix)
@@ -146,4 +159,42 @@ def no_own_gradient(context: Context) -> None:
             )
 
 
-CHECKS = (deterministic, batch_invariant, inputs_unchanged, no_global_state, no_own_gradient)
+@check(
+    "another-process",
+    mend="name files from `Path(__file__).parent`; end what was started; keep nothing",
+    needs=("deterministic", "batch-invariant"),
+)
+def another_process(context: Context) -> None:
+    """A new process elsewhere makes the same bodies and ends; the package stays as it is."""
+    if context.first_written:
+        raise CheckFailedError(
+            f"the folder of {context.offer.package} after building",
+            got=f"{', '.join(context.first_written):.200} written",
+            expected="nothing written: an installed package may be read-only, and others share it",
+            fix="Write to a folder in soma_core.plugin.data_dir(), or use soma_core.plugin.cached_arrays.",
+        )
+    params = context.random_params(_BODIES, seed=1) or context.default_params()
+    probe = probe_process(context.offer, context.options, {key: each.numpy() for key, each in params.items()})
+    where = "a new process in an empty folder"
+    if probe.bodies is None:
+        fix = "Name files from Path(__file__).parent, not from the current folder, and end no process."
+        raise CheckFailedError(where, got=probe.ending, expected="the bodies that are made here", fix=fix)
+    fix = "Depend on no order of a set, no time and no state of the machine."
+    _compare(
+        context, torch.from_numpy(probe.bodies), _rest(context.generator, params), f"rest() in {where}", fix
+    )
+    if probe.ending:
+        fix = "End threads and processes before, or make them daemons; let no exit handler end the process."
+        raise CheckFailedError(where, got=probe.ending, expected="an end with exit code 0", fix=fix)
+    if probe.growth > _KEPT * probe.bodies.nbytes:
+        raise CheckFailedError(
+            f"memory of {where}",
+            got=f"{probe.growth / 2**20:.1f} MiB more after each call of rest()",
+            expected="as much as before, since results are the caller's",
+            fix="Keep no results, no parameters and no graphs of calls.",
+        )
+
+
+CHECKS = (
+    deterministic, batch_invariant, inputs_unchanged, no_global_state, no_own_gradient, another_process,
+)  # fmt: skip

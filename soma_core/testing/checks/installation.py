@@ -9,6 +9,7 @@ from omegaconf import OmegaConf
 
 from soma_core.plugin.checks import CheckFailedError, check
 from soma_core.plugin.options import checked_options, options_by_name
+from soma_core.points.point_set import load_point_set
 from soma_core.testing.context import Context
 
 __all__ = ["CHECKS"]
@@ -53,7 +54,7 @@ def import_silent(context: Context) -> None:
     "config-composes", mend="add the file; its `name:` is the backend's", level="core", needs=("declares",)
 )
 def config_composes(context: Context) -> None:
-    """The package ships configs/backend/<name>.yaml, and hydra composes it."""
+    """The package ships configs/backend/<name>.yaml, and hydra composes it; its point sets read."""
     where = f"configs/backend/{context.name}.yaml"
     try:
         name = context.composed.name
@@ -68,6 +69,9 @@ def config_composes(context: Context) -> None:
         raise CheckFailedError(
             where, got=f"name: {name}", expected=f"name: {context.name}", fix="Correct the file."
         )
+    own = [each for each, offer in context.registry.config_offers().items() if offer.name == context.name]
+    for path in (path for folder in own for path in (folder / "point_sets").glob("*.json")):
+        load_point_set(path)
 
 
 @check(

@@ -115,6 +115,8 @@ def gradient(context: Context) -> None:
     def pull(params: Mapping[str, Tensor]) -> Tensor:
         return (context.generator.rest(params) * cotangent).flatten(1).sum(1)
 
+    _finite_at_defaults(pull, context)
+    _slopes(pull, start)  # a graph that outlives its call shows in the next one
     changes = entry_changes(context.parameters, to="far", limit=_GRADIENT_ENTRIES)
     slopes = _slopes(pull, start)
     got = torch.stack([slopes[change.parameter.name][change.entry] for change in changes])
@@ -136,6 +138,18 @@ def gradient(context: Context) -> None:
             expected=f"{float(expected[wrong[0]]):.6g}, the finite difference of a sum of coordinates",
             fix="Compute in torch from the parameters to the vertices, without detach, .data or NumPy.",
         )
+
+
+def _finite_at_defaults(pull: Pull, context: Context) -> None:
+    """At the defaults, where a fit begins, a root or a norm of zero has no derivative."""
+    for name, slope in _slopes(pull, context.default_params()).items():
+        if not torch.isfinite(slope).all():
+            raise CheckFailedError(
+                f"derivative by {name} at the defaults",
+                got=f"{float(slope[~torch.isfinite(slope)][0]):g}",
+                expected="a finite number: a fit begins there",
+                fix="Guard the root, norm, division or angle that has no derivative there.",
+            )
 
 
 def _widths(changes: Sequence[Change]) -> Tensor:
