@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 from dataclasses import dataclass
 
 import numpy as np
@@ -21,42 +20,15 @@ _BALL, _FRONT = 0.19, 0.15
 _PUPIL, _IRIS, _WHITE = (24, 22, 22), (96, 74, 54), (236, 234, 230)
 _PUPIL_DEG, _IRIS_DEG = 12, 27
 
-_ICOSAHEDRON = (
-    (0, 11, 5), (0, 5, 1), (0, 1, 7), (0, 7, 10), (0, 10, 11), (1, 5, 9), (5, 11, 4), (11, 10, 2), (10, 7, 6),
-    (7, 1, 8), (3, 9, 4), (3, 4, 2), (3, 2, 6), (3, 6, 8), (3, 8, 9), (4, 9, 5), (2, 4, 11), (6, 2, 10),
-    (8, 6, 7), (9, 8, 1),
-)  # fmt: skip
 
-
-@functools.cache
 def eyeball() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """A ball of radius 1 that looks along +Z: vertices (v, 3), triangles (t, 3) and sRGB (v, 3) in 0..255.
+    """A ball of radius 1 that looks along +Z: vertices (v, 3), triangles (t, 3) and sRGB (v, 3) in 0..255."""
+    import trimesh
 
-    The arrays are read-only.
-    """
-    vertices, faces = _icosphere(4)
-    off = np.degrees(np.arccos(np.clip(vertices[:, 2], -1, 1)))[:, None]
+    ball = trimesh.creation.icosphere(subdivisions=4)
+    off = np.degrees(np.arccos(np.clip(ball.vertices[:, 2], -1, 1)))[:, None]
     shades = np.select([off < _PUPIL_DEG, off < _IRIS_DEG], [_PUPIL, _IRIS], _WHITE).astype(np.uint8)
-    for array in (vertices, faces, shades):
-        array.setflags(write=False)
-    return vertices, faces, shades
-
-
-def _icosphere(times: int) -> tuple[np.ndarray, np.ndarray]:
-    """An icosahedron with each triangle divided into four so many times, on the unit sphere."""
-    short, long = 0.5257311121191336, 0.85065080835204
-    corners = np.array([[-short, long, 0], [short, long, 0], [-short, -long, 0], [short, -long, 0]])
-    vertices = np.concatenate([np.roll(corners, turn, axis=1) for turn in range(3)])
-    faces = np.array(_ICOSAHEDRON)
-    for _ in range(times):
-        ends = np.sort(faces[:, [[0, 1], [1, 2], [2, 0]]], axis=2)[..., ::-1].reshape(-1, 2)
-        edges, place = np.unique(ends, axis=0, return_inverse=True)
-        (a, b, c), (ab, bc, ca) = faces.T, place.reshape(-1, 3).T + len(vertices)
-        faces = np.stack([a, ab, ca, ab, b, bc, ca, bc, c, ab, bc, ca], axis=1).reshape(-1, 3)
-        vertices = np.concatenate([vertices, vertices[edges].mean(axis=1)])
-        length = np.sqrt(np.dot(vertices**2, [1, 1, 1]))[:, None]
-        vertices += vertices / length * (1 - length)
-    return vertices, faces
+    return np.asarray(ball.vertices), np.asarray(ball.faces), shades
 
 
 def eyeball_places(joints: np.ndarray, turns: np.ndarray) -> tuple[float, np.ndarray]:

@@ -20,14 +20,6 @@ EYE_TOLERANCE_MM = 0.01
 VERTEX_TOLERANCE_MM = 0.1
 
 
-def test_an_eyeball_is_the_icosphere_that_mesh_libraries_make():
-    vertices, faces, _ = eyeball()
-    creation = pytest.importorskip("trimesh.creation", reason="trimesh is not installed")
-    ball = creation.icosphere(subdivisions=4)
-    np.testing.assert_array_equal(faces, ball.faces)
-    np.testing.assert_allclose(vertices, ball.vertices, rtol=0, atol=1e-15)
-
-
 @pytest.fixture(scope="module")
 def layer():
     return SomaLayer("soma", lod="low", correctives=None, procedural=False)
