@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib
-import importlib.metadata
 import json
 import logging
 import os
@@ -19,6 +18,7 @@ from omegaconf import DictConfig, OmegaConf
 from soma_core.cache import atomic_text
 from soma_core.errors import SomaError
 from soma_core.paths import assets_dir
+from soma_core.plugin.discovery import installed_versions
 from soma_core.plugin.registry import default_registry
 from soma_core.progress import PrintableFormatter
 from soma_core.rig.manifest import read_manifest
@@ -40,7 +40,6 @@ def _rig_revision() -> str:
 
 def describe_environment(config: DictConfig, *, command: Sequence[str]) -> dict[str, Any]:
     """What is needed to run it again: versions, rig, device, seed, SOMA_* variables, command line."""
-    found = {dist.metadata["Name"]: dist.version for dist in importlib.metadata.distributions()}
     return {
         "command": list(command),
         "python": platform.python_version(),
@@ -53,7 +52,7 @@ def describe_environment(config: DictConfig, *, command: Sequence[str]) -> dict[
             for entry in default_registry().entries()
         ],
         "variables": {key: value for key, value in sorted(os.environ.items()) if key.startswith("SOMA_")},
-        "distributions": dict(sorted(found.items(), key=lambda item: item[0].lower())),
+        "distributions": dict(sorted(installed_versions().items(), key=lambda item: item[0].lower())),
     }
 
 

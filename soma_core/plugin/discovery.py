@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import importlib.machinery
 import importlib.metadata
 import importlib.util
@@ -24,6 +25,7 @@ __all__ = [
     "config_folder",
     "find_offers",
     "hide_damaged",
+    "installed_versions",
     "normalised",
     "read_installed",
 ]
@@ -111,16 +113,33 @@ def find_offers(entry_points: Iterable[EntryPointLike] | None = None) -> dict[st
     """
     found: dict[tuple[str, str], Offer] = {}
     for point in read_installed()[0] if entry_points is None else entry_points:
-        distribution = getattr(point.dist, "name", None) or "unknown distribution"
-        version = getattr(point.dist, "version", None) or ""
         offer = Offer(
-            name=point.name, distribution=distribution, version=version, target=point.value, load=point.load
-        )
-        found.setdefault((point.name, normalised(distribution)), offer)
+            name=point.name, distribution=_told(point.dist, "name") or "unknown distribution",
+            version=_told(point.dist, "version"), target=point.value, load=point.load,
+        )  # fmt: skip
+        found.setdefault((point.name, normalised(offer.distribution)), offer)
     grouped: dict[str, tuple[Offer, ...]] = {}
     for (name, _), offer in sorted(found.items()):
         grouped[name] = (*grouped.get(name, ()), offer)
     return grouped
+
+
+def _told(distribution: object, field: str) -> str:
+    """A field of a distribution's metadata, empty where it is left out: some day a KeyError (Python 3.12)."""
+    try:
+        return getattr(distribution, field, None) or ""
+    except (KeyError, DeprecationWarning):
+        return ""
+
+
+def installed_versions() -> dict[str, str]:
+    """Version of each installed distribution, by its name; without those whose metadata cannot be read."""
+    found: dict[str, str] = {}
+    for distribution in importlib.metadata.distributions():
+        with contextlib.suppress(Exception):  # whatever a damaged file makes of the standard library's parser
+            if name := _told(distribution, "name"):
+                found.setdefault(name, _told(distribution, "version"))
+    return found
 
 
 def read_installed() -> tuple[tuple[EntryPointLike, ...], tuple[Damaged, ...]]:
@@ -139,7 +158,7 @@ def read_installed() -> tuple[tuple[EntryPointLike, ...], tuple[Damaged, ...]]:
     for number, distribution in enumerate(importlib.metadata.distributions()):
         folder, name = str(distribution.locate_file("")), ""
         try:
-            name = distribution.metadata["Name"] or ""
+            name = _told(distribution, "name")
             found = distribution.entry_points.select(group=ENTRY_POINT_GROUP)
             points.setdefault(normalised(name) or str(number), tuple(found))
         except Exception as error:

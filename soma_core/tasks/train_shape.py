@@ -19,6 +19,7 @@ from soma_core.correctives.processes import Processes, joined_processes
 from soma_core.errors import InputError
 from soma_core.layer import SomaLayer
 from soma_core.paths import cache_dir
+from soma_core.plugin.discovery import installed_versions
 from soma_core.plugin.registry import default_registry
 from soma_core.progress import progress
 from soma_core.rig import load_canonical
@@ -176,7 +177,7 @@ def _installed_requirements(distribution: str) -> Mapping[str, str]:
     except importlib.metadata.PackageNotFoundError:
         return {}
     names = [re.split(r"[^A-Za-z0-9._-]", line)[0] for line in requirements if "extra ==" not in line]
-    installed = {item.metadata["Name"].lower(): item.version for item in importlib.metadata.distributions()}
+    installed = {name.lower(): version for name, version in installed_versions().items()}
     return {name: installed[name.lower()] for name in names if name.lower() in installed}
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from soma_core.plugin.discovery import Offer, config_folder, find_offers, normalised
+from soma_core.plugin.discovery import Offer, config_folder, find_offers, installed_versions, normalised
 from soma_core.plugin.registry import Registry
 from tests.plugin.fakes import FakeEntryPoint
 from tests.plugin.installed import Distribution
@@ -81,6 +81,7 @@ def test_damaged_metadata_hurts_nobody_else(site: Path, file: str, text: str) ->
     (Distribution(name="bad").write_metadata(site) / file).write_text(text)
     registry = Registry()
     assert {"acme", "soma"} <= set(registry.names())
+    assert {"soma-backend-acme", "hydra-core"} <= installed_versions().keys()
     damaged = [entry for entry in registry.entries() if entry.name == "-"]
     if "no value" in text:
         (row,) = damaged
@@ -95,6 +96,7 @@ def test_damage_that_hides_a_name_is_told_by_its_folder(site: Path) -> None:
     (row,) = [entry for entry in Registry().entries() if entry.name == "-"]
     assert str(row.error).startswith(f"{folder.name} in {site}: lookup")
     assert str(row.error).endswith("Install its package again, or remove it")
+    assert installed_versions()["hydra-core"]
 
 
 def test_blocked_backends_add_no_configs(site: Path) -> None:
