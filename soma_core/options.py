@@ -89,6 +89,12 @@ def _member(name: str, kind: type[StrEnum], value: object) -> StrEnum:
     return kind(value)
 
 
+def _within(name: str, value: float, least: float, most: float) -> None:
+    """Refuse a number outside its range."""
+    if not least <= value <= most:
+        raise InputError(name, got=value, expected=f"a number from {least} to {most}", fix="Leave it out.")
+
+
 @dataclass(kw_only=True)
 class BackendChoice(Options):
     """An identity: the backend, its parameters (None: the default) and its options."""
@@ -160,6 +166,12 @@ class Picture(Options):
     frames: int = 10
     width: int = 1600
 
+    def __post_init__(self) -> None:
+        """Refuse what no picture has."""
+        super().__post_init__()
+        _within("picture.frames", self.frames, 0, 10000)
+        _within("picture.width", self.width, 100, 16384)
+
 
 @dataclass(kw_only=True)
 class VideoChoice(Options):
@@ -175,18 +187,9 @@ class VideoChoice(Options):
     def __post_init__(self) -> None:
         """Refuse what no video has."""
         super().__post_init__()
-        for name, value, most in (
-            ("size", self.size, 4096),
-            ("fps", self.fps, 240),
-            ("seconds", self.seconds, 600),
-        ):
-            if value is not None and not 0 < value <= most:
-                raise InputError(
-                    f"video.{name}",
-                    got=value,
-                    expected=f"a number above 0, at most {most}",
-                    fix="Leave it out.",
-                )
+        _within("video.size", self.size, 2, 4096)
+        _within("video.fps", 1 if self.fps is None else self.fps, 0.001, 240)
+        _within("video.seconds", self.seconds, 0.001, 600)
         if self.size % 2:
             raise InputError(
                 "video.size", got=self.size, expected="an even number", fix="Pass video.size=720."

@@ -198,7 +198,7 @@ def write_bvh_file(path: Path, played: Played, choice: BvhChoice) -> None:
 
 def draw_contact_sheet(path: Path, played: Played, picture: Picture) -> None:
     """Draw frames of a motion, the middles of equal parts of it: both its ends are often the same pose."""
-    count, total = picture.frames, played.motion.frame_count
+    count, total = picture.frames or Picture().frames, played.motion.frame_count
     frames = np.unique(((np.arange(count) + 0.5) * total / count).astype(int)).tolist()
     contact_sheet(path, [_drawn(played, frame) for frame in frames], width=picture.width)
 

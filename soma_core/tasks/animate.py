@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 import torch
 from omegaconf import OmegaConf
 
+from soma_core.choices import Product
 from soma_core.errors import InputError
 from soma_core.motion.animated import standing_motion
 from soma_core.motion.conversion import load_clip
@@ -72,8 +73,9 @@ def run(config: DictConfig, output: Path) -> None:
         identity = stored_identity(layer, stored)
         placed = standing_motion(layer, identity, motion, placing_of(options))
     played = Played(layer=layer, identity=identity, motion=replace(placed, identity=stored))
+    wanted = [each for each in options.write if each is not Product.png or options.picture.frames]
     written = write_products(
-        played, options.write, lambda product: output / WRITERS[product].file,
+        played, wanted, lambda product: output / WRITERS[product].file,
         options=options, picture=options.picture,
     )  # fmt: skip
     _log.info("wrote %s", ", ".join(place.name for place in written.values()) or "nothing")

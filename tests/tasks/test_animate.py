@@ -13,7 +13,7 @@ from soma_core.errors import InputError
 from soma_core.io import read_motion, write_motion
 from soma_core.io.vertex_files import open_vertex_sequence
 from soma_core.layer import SomaLayer
-from soma_core.motion import animate, animated, load_clip, stored_identity, write
+from soma_core.motion import Picture, animate, animated, load_clip, stored_identity, write
 from soma_core.options import FrameRange
 from soma_core.tasks import animate as task
 
@@ -78,6 +78,17 @@ def test_picture_is_written(tmp_path):
     pytest.importorskip("pyvista", reason="pictures need pyvista")
     task.run(configured(write=["png"], picture={"frames": 2, "width": 200}), tmp_path)
     assert (tmp_path / "contact_sheet.png").stat().st_size > 1000
+
+
+def test_no_frames_are_no_picture(tmp_path):
+    task.run(configured(write=["npz", "png"], picture={"frames": 0}), tmp_path)
+    assert [path.name for path in tmp_path.iterdir()] == ["motion.npz"]
+
+
+@pytest.mark.parametrize(("name", "value"), [("frames", -1), ("width", 0), ("width", 10**6)])
+def test_pictures_of_no_size_are_refused(name, value):
+    with pytest.raises(InputError, match=rf"picture\.{name}: got {value}, expected a number from \d+ to"):
+        Picture(**{name: value})
 
 
 def test_gallery_of_all_backends(tmp_path, monkeypatch):
