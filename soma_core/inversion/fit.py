@@ -35,6 +35,7 @@ from soma_core.inversion.result import InversionResult, joined
 from soma_core.inversion.start import cloud_extent
 from soma_core.inversion.targets import Frames, LadderOptions, Skinning, Stage, Targets
 from soma_core.inversion.whole import FEW, is_worse, lopsided, of_another_rig, right_vertices
+from soma_core.kernels._threads import in_parts, shared_out, side_by_side
 from soma_core.layer import Kernels, SomaLayer
 from soma_core.rig import load_canonical
 from soma_core.skeleton.identity import Identity
@@ -45,8 +46,8 @@ __all__ = ["PoseInversion", "Topology"]
 
 Topology = Literal["canonical", "native"]
 
-_CHUNK = 512
-"""Frames fitted at a time: enough to fill the SIMD lanes of every core, little enough for memory."""
+_CHUNK, _SEVERAL = 512, 64
+"""Frames fitted at a time, enough to fill all SIMD lanes and few enough for memory; those worth a thread."""
 
 _SCALES = (0.2, 5.0)
 """A body this much smaller or larger than its identity is in another unit, or no body."""
@@ -251,10 +252,11 @@ class PoseInversion(Derived):
         )  # fmt: skip
 
     def _fit_all(self, frames: Frames) -> InversionResult:
-        """Fit chunk by chunk."""
-        count, size = len(frames.vertices), max(_CHUNK, self.model.frames_on_gpu())
-        starts = range(0, count, size) or (0,)
-        fits = [self._fit(frames.part(slice(first, first + size))) for first in starts]
+        """Fit chunk by chunk, side by side."""
+        count, most = len(frames.vertices), max(_CHUNK, self.model.frames_on_gpu())
+        with side_by_side(count, _SEVERAL, frames.vertices) as threads:
+            parts = [frames.part(part) for part in shared_out(count, most, threads)]
+            fits = in_parts(self._fit, parts, threads)
         if not any(bool(result.valid.any()) for result, _ in fits):
             refuse_unit_error(torch.cat([scale for _, scale in fits]))
         return joined([result for result, _ in fits])
@@ -361,11 +363,9 @@ class PoseInversion(Derived):
         Joints of which `problem` leaves out most vertices that `among` has are not determined.
         """
         vertices, finite = without_gaps(frames.vertices, frames.weights, self.layer)
-        eye = torch.eye(3, dtype=vertices.dtype, device=vertices.device)
-        rest = problem.rest
+        eye, rest = torch.eye(3, dtype=vertices.dtype, device=vertices.device), problem.rest
         extent, side = cloud_extent(problem.target, rest)
-        known = torch.where(rest.own[..., 3, 3] > 0, extent, torch.nan)
-        scale = known.nanmedian(1).values
+        scale = torch.where(rest.own[..., 3, 3] > 0, extent, torch.nan).nanmedian(1).values
         upright = (side * rest.own[..., 3, 3]).sum(1) > 0
         usable = finite & upright & (scale > _SCALES[0]) & (scale < _SCALES[1])
         relative = torch.where(usable[:, None, None, None], pose.relative, eye)

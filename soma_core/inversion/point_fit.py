@@ -17,7 +17,7 @@ from soma_core.inversion.point_rows import PointRows, rows_of
 from soma_core.inversion.point_start import PointStart
 from soma_core.inversion.problem import Pose, part_of
 from soma_core.inversion.result import InversionResult
-from soma_core.kernels._threads import in_parts
+from soma_core.kernels._threads import in_parts, shared_out
 from soma_core.skeleton.identity import Identity
 
 __all__ = ["FEWEST", "SEVERAL", "PointFit", "PointResult", "bridged", "determined", "paces", "trusted"]
@@ -139,11 +139,7 @@ class PointFit:
 
     def _chunks(self) -> Iterator[_Chunk]:
         """The frames, some at a time: as many for every thread."""
-        count = len(self.points)
-        parts = self.threads * max(1, -(-count // (self.threads * _CHUNK)))
-        size = max(1, -(-count // parts))
-        for first in range(0, count, size):
-            part = slice(first, first + size)
+        for part in shared_out(len(self.points), self.threads * _CHUNK, self.threads):
             pose = Pose(**{name: value[part] for name, value in vars(self.pose).items()})
             weights = self.weights if len(self.weights) == 1 else self.weights[part]
             yield _Chunk(part, self._rest_of(part), self.points[part] - self.shift[part], weights, pose)

@@ -11,11 +11,15 @@ from typing import TypeVar
 import torch
 from torch import Tensor
 
-__all__ = ["in_parts", "in_threads", "side_by_side"]
+__all__ = ["in_parts", "in_threads", "shared_out", "side_by_side"]
 
 _own = threading.local()
 
-_Part, _Made = TypeVar("_Part"), TypeVar("_Made")
+_ABREAST = 16
+"""Frames that lie in the lanes of one SIMD register: parts are multiples."""
+
+_Part = TypeVar("_Part")
+_Made = TypeVar("_Made")
 
 
 def in_threads(run: Callable[[slice], None], count: int, like: Tensor) -> None:
@@ -45,6 +49,13 @@ def in_parts(run: Callable[[_Part], _Made], parts: Sequence[_Part], threads: int
             return run(part)
 
     return list(_pool(os.getpid(), threads).map(alone, parts))
+
+
+def shared_out(count: int, most: int, threads: int) -> list[slice]:
+    """Parts of `count` frames, as many for every thread; at most `most` frames are under way at a time."""
+    parts = threads * max(1, -(-count // most))
+    size = max(1, -(-count // (parts * _ABREAST))) * _ABREAST
+    return [slice(first, first + size) for first in range(0, count, size) or (0,)]
 
 
 @contextlib.contextmanager

@@ -12,7 +12,7 @@ import pytest
 import torch
 
 from soma_core.kernels._runtime import once
-from soma_core.kernels._threads import in_parts, in_threads, side_by_side
+from soma_core.kernels._threads import in_parts, in_threads, shared_out, side_by_side
 
 MANY = torch.zeros(8)
 
@@ -75,6 +75,18 @@ def test_parts_start_no_threads_of_their_own():
     in_parts(lambda _: in_threads(seen.append, 5, MANY), [0, 1, 2], 2)
     assert seen == [slice(0, 5)] * 3
     assert in_parts(lambda _: in_parts(lambda part: part, [1, 2], 2), [0, 1], 2) == [[1, 2]] * 2
+
+
+@pytest.mark.parametrize(
+    ("count", "most", "threads", "parts"),
+    [(0, 512, 1, 1), (1, 512, 1, 1), (2049, 2048, 1, 2), (600, 512, 2, 4)],
+)
+def test_frames_are_shared_out_evenly_in_whole_lanes(count: int, most: int, threads: int, parts: int):
+    found = shared_out(count, most, threads)
+    rows = [range(count)[part] for part in found]
+    assert len(found) == parts
+    assert [row for own in rows for row in own] == list(range(count))
+    assert all(len(own) % 16 == 0 and len(own) - len(rows[-1]) < 16 * parts for own in rows[:-1])
 
 
 @pytest.mark.usefixtures("two")
