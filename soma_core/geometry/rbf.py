@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
+
 import numpy as np
 import scipy.linalg
 from scipy.spatial.distance import cdist
@@ -32,15 +34,29 @@ def affine_rbf_weights(points: np.ndarray, queries: np.ndarray) -> np.ndarray:
     local, targets = (points - centre) / scale, (queries - centre) / scale
     count = len(local)
     polynomial = np.hstack([np.ones((count, 1)), local])
-    system = np.zeros((count + 4, count + 4))
-    system[:count, :count] = cdist(local, local)
-    system[:count, count:] = polynomial
-    system[count:, :count] = polynomial.T
-    right = np.vstack([cdist(local, targets), np.ones((1, len(targets))), targets.T])
+    right, sums = cdist(local, targets), np.vstack([np.ones((1, len(targets))), targets.T])
     singular = np.linalg.svd(local, compute_uv=False)
-    flat = count < 4 or singular[-1] < _RANK_TOLERANCE * singular[0]
-    if flat:
-        solution = scipy.linalg.lstsq(system, right, cond=1e-12)[0]
-    else:
-        solution = scipy.linalg.solve(system, right, assume_a="gen", overwrite_a=True, check_finite=False)
-    return solution[:count].T
+    if count >= 4 and singular[-1] >= _RANK_TOLERANCE * singular[0]:
+        with suppress(scipy.linalg.LinAlgError):  # points that coincide but for rounding
+            return _definite(cdist(local, local), polynomial, right, sums).T
+    system = np.block([[cdist(local, local), polynomial], [polynomial.T, np.zeros((4, 4))]])
+    return scipy.linalg.lstsq(system, np.vstack([right, sums]), cond=1e-12)[0][:count].T
+
+
+def _definite(kernel: np.ndarray, polynomial: np.ndarray, right: np.ndarray, sums: np.ndarray) -> np.ndarray:
+    """Weights (n, q) with ``kernel @ weights - right`` in the span of `polynomial`, whose sums are `sums`.
+
+    Distances are negative definite where the sums are zero, so that Cholesky's half of the work is enough.
+    """
+    (mirrors, scales), triangle = scipy.linalg.qr(polynomial, mode="raw")
+    room = 64 * len(kernel)
+
+    def turned(side: str, kind: str, array: np.ndarray) -> np.ndarray:
+        return scipy.linalg.lapack.dormqr(side, kind, mirrors, scales, array, room, overwrite_c=1)[0]
+
+    kernel = turned("R", "N", turned("L", "T", kernel.T))  # it is symmetric, and LAPACK wants columns
+    fixed = scipy.linalg.solve_triangular(triangle[:4], sums, trans="T")
+    given = kernel[4:, :4] @ fixed - turned("L", "T", np.asfortranarray(right))[4:]
+    factor = scipy.linalg.cho_factor(-kernel[4:, 4:], lower=True, overwrite_a=True, check_finite=False)
+    free = scipy.linalg.cho_solve(factor, given, check_finite=False)
+    return turned("L", "N", np.asfortranarray(np.vstack([fixed, free])))

@@ -104,3 +104,13 @@ def test_coincident_points_share_a_weight():
     np.testing.assert_allclose(weights @ doubled, QUERIES, atol=EXACT)
     np.testing.assert_allclose(weights[:, :3], weights[:, 20:23], atol=EXACT)
     np.testing.assert_allclose(weights[:, :3], weights[:, 27:], atol=EXACT)
+
+
+def test_points_that_coincide_but_for_rounding():
+    points = np.concatenate([cloud(30), cloud(30) * (1 + 1e-16)])
+    points[30:, 0] = np.nextafter(points[:30, 0], 2)
+    weights = affine_rbf_weights(points, QUERIES)
+    np.testing.assert_allclose(weights @ points, QUERIES, atol=EXACT)
+    np.testing.assert_allclose(
+        weights[:, :30] + weights[:, 30:], affine_rbf_weights(cloud(30), QUERIES), atol=EXACT
+    )
