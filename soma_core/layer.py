@@ -30,6 +30,7 @@ from soma_core.compiled import CompiledLayer
 from soma_core.correctives.model import find_correctives, load_correctives
 from soma_core.errors import InputError
 from soma_core.geometry.torch_func import untracked
+from soma_core.kernels.ahead import kernels_ahead
 from soma_core.paths import expanded
 from soma_core.plugin.registry import Registry, default_registry
 from soma_core.plugin.spec import HasSkinning
@@ -113,6 +114,20 @@ class SomaLayer(PartialBodies):
 
     def _build(self, device: torch.device, dtype: torch.dtype) -> None:
         self.device, self.dtype = device, dtype
+        with kernels_ahead(self.kernels, device, dtype, wrap=self.spec.wrap is not None):
+            self._build_rest_shape(device, dtype)
+        self.animation = Animation(self.rig, device=device, dtype=dtype, kernels=self.kernels)
+        self.posing = self.animation
+        if self.procedural:
+            self.posing = ProceduralAnimation(self.rig, device=device, dtype=dtype, kernels=self.kernels)
+        self.correctives = load_correctives(
+            self.correctives_file, self.mesh, self.rig, dtype=dtype, device=device
+        )
+        self.fused: FusedPose | None = None
+        if self.kernels != "torch":
+            self.fuse(by_patches=device.type == "cuda")
+
+    def _build_rest_shape(self, device: torch.device, dtype: torch.dtype) -> None:
         generator = self.registry.generator(self.backend, device=device, dtype=dtype, options=self.options)
         self.tells_skinning = isinstance(generator, HasSkinning)
         wrap_mesh = self.mesh if self.mesh.lod == "mid" else load_canonical("mid", self.mesh.root)[0]
@@ -125,16 +140,6 @@ class SomaLayer(PartialBodies):
             warp=self.kernels != "torch", wrap_mesh=wrap_mesh, reduction=reduction,
             isolated=functools.partial(self.registry.isolated, self.backend),
         )  # fmt: skip
-        self.animation = Animation(self.rig, device=device, dtype=dtype, kernels=self.kernels)
-        self.posing = self.animation
-        if self.procedural:
-            self.posing = ProceduralAnimation(self.rig, device=device, dtype=dtype, kernels=self.kernels)
-        self.correctives = load_correctives(
-            self.correctives_file, self.mesh, self.rig, dtype=dtype, device=device
-        )
-        self.fused: FusedPose | None = None
-        if self.kernels != "torch":
-            self.fuse(by_patches=device.type == "cuda")
 
     def fuse(self, *, by_patches: bool = True) -> None:
         """Let few kernels do what no gradient is asked of; no derivative is lost.
@@ -202,14 +207,9 @@ class SomaLayer(PartialBodies):
     def _identity(self, params: Mapping[str, Tensor], points: Tensor, fitted: Tensor) -> Identity:
         rest, bind = self.animation.repose(points, fitted) if self.repose else (points, fitted)
         return Identity(
-            rest=rest.permute(2, 1, 0),
-            bind_world=bind,
-            fitted_rest=points.permute(2, 1, 0),
-            fitted_world=fitted,
-            backend=self.backend,
-            rig_revision=self.rig.revision,
-            params=params,
-        )
+            rest=rest.permute(2, 1, 0), bind_world=bind, fitted_rest=points.permute(2, 1, 0),
+            fitted_world=fitted, backend=self.backend, rig_revision=self.rig.revision, params=params,
+        )  # fmt: skip
 
     @own_precision
     def pose(

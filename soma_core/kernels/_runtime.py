@@ -8,8 +8,8 @@ import logging
 import os
 import sys
 import threading
-from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any, TypeVar
 
 import torch
@@ -17,7 +17,7 @@ import warp as wp
 
 from soma_core.errors import InputError
 
-__all__ = ["as_warp", "launching", "loaded", "once", "scalar_name", "start"]
+__all__ = ["as_warp", "begin_loading", "launching", "loaded", "once", "scalar_name", "start"]
 
 _log = logging.getLogger(__name__)
 
@@ -128,8 +128,18 @@ def loaded(kernel: wp.Kernel, device: Any) -> wp.Kernel:
 
 @functools.cache
 def _load(process: int, kernel: wp.Kernel) -> None:
-    load = functools.partial(wp.load_module, kernel.module, device="cpu", block_dim=1, max_workers=0)
-    _compiler(process).submit(load).result()
+    _begin(process, kernel).result()
+
+
+def begin_loading(kernels: Iterable[wp.Kernel]) -> list[Future[None]]:
+    """Compile kernels for a CPU, one after the other, while the caller goes on; see :func:`loaded`."""
+    start()
+    return [_begin(os.getpid(), kernel) for kernel in kernels]
+
+
+def _begin(process: int, kernel: wp.Kernel) -> Future[None]:
+    # a CPU's launch is one thread a block, whatever it asks for
+    return _compiler(process).submit(wp.load_module, kernel.module, device="cpu", block_dim=1, max_workers=0)
 
 
 @once

@@ -18,9 +18,10 @@ from soma_core.kernels._runtime import as_warp, once, scalar_name
 from soma_core.kernels._threads import in_threads
 from soma_core.kernels._view_text import TANH
 
-__all__ = ["Added", "Blend", "Strides", "blend_of", "drawing", "lanes_of", "skin_bodies", "strides_of"]
+__all__ = ["WIDTHS", "Added", "Blend", "Strides", "blend_of", "drawing", "lanes_of", "skin_bodies",
+           "skinning", "strides_of"]  # fmt: skip
 
-_WIDTHS = {torch.float32: (4, 8, 16), torch.float64: (4, 8)}
+WIDTHS = {torch.float32: (4, 8, 16), torch.float64: (4, 8)}
 """Bodies a thread may treat at once: SIMD registers of current CPUs, wide ones split where there are none."""
 
 _ids, _short = wp.array(dtype=wp.int32), wp.array(dtype=wp.int16)
@@ -94,7 +95,8 @@ class Strides:
 
 
 @once
-def _kernel(scalar: str, lanes: int):
+def skinning(scalar: str, lanes: int):
+    """Kernel of :func:`skin_bodies`."""
     width, size = lanes, TILE
     real, rows = wp.array(dtype=getattr(wp, scalar)), wp.array3d(dtype=getattr(wp, scalar))
     (load, store), row = transposing(scalar, lanes), row_of(scalar)
@@ -265,7 +267,7 @@ def skin_bodies(
     lanes, tiles = lanes_of(count, points), -(-vertices // TILE)
     groups, threads = -(-count // lanes), torch.get_num_threads()
     shares = max(1, min(threads // groups, tiles))  # of the tiles, where there are more threads than groups
-    kernel, none = _kernel(scalar_name(points.dtype), lanes), points.new_zeros(1)
+    kernel, none = skinning(scalar_name(points.dtype), lanes), points.new_zeros(1)
     blends = skin, first or skin, *((skin, skin) if added is None else added[:2])
     frames = [none if one is None else one.contiguous() for one in (transforms, before, features)]
     strides = strides_of(points)
@@ -310,5 +312,5 @@ def strides_of(points: Tensor) -> Strides:
 def lanes_of(count: int, like: Tensor) -> int:
     """Bodies a thread treats at once: as few as keep every thread busy, as many as a register holds."""
     share = -(-count // torch.get_num_threads())
-    widths = _WIDTHS[like.dtype]
+    widths = WIDTHS[like.dtype]
     return next((width for width in widths if width >= share), widths[-1])

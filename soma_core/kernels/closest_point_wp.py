@@ -5,11 +5,12 @@ import warp as wp
 
 from soma_core.kernels._runtime import loaded, start
 
-__all__ = ["closest_faces", "face_table", "nearest_touching"]
+__all__ = ["closest", "closest_faces", "face_table", "nearest_touching"]
 
 
-@wp.kernel
-def _closest(mesh: wp.uint64, points: wp.array(dtype=wp.vec3), face: wp.array(dtype=wp.int32)):
+@wp.kernel(enable_backward=False)
+def closest(mesh: wp.uint64, points: wp.array(dtype=wp.vec3), face: wp.array(dtype=wp.int32)):
+    """Kernel of :func:`closest_faces`."""
     i = wp.tid()
     query = wp.mesh_query_point_no_sign(mesh, points[i], wp.float32(1.0e6))
     face[i] = query.face
@@ -33,7 +34,7 @@ def closest_faces(points: np.ndarray, vertices: np.ndarray, triangles: np.ndarra
     )
     found = wp.empty(len(points), dtype=wp.int32, device="cpu")
     queries = wp.array(points.astype(np.float32), dtype=wp.vec3, device="cpu")
-    wp.launch(loaded(_closest, "cpu"), dim=len(points), inputs=[mesh.id, queries, found], device="cpu")
+    wp.launch(loaded(closest, "cpu"), dim=len(points), inputs=[mesh.id, queries, found], device="cpu")
     return found.numpy().astype(np.int64)
 
 

@@ -15,7 +15,7 @@ from soma_core.kernels._posing_text import body_text
 from soma_core.kernels._runtime import as_warp, launching, loaded, once, scalar_name
 from soma_core.kernels._threads import in_threads
 
-__all__ = ["pose_bodies", "skin_patches"]
+__all__ = ["pose_bodies", "posing", "skin_patches"]
 
 _BODY_THREADS, _PATCH_THREADS = 256, 128
 _FEW = 8
@@ -29,7 +29,8 @@ _ints, _shorts = wp.array(dtype=wp.int32), wp.array(dtype=wp.int16)
 
 
 @once
-def _body_kernel(scalar: str) -> wp.Kernel:
+def posing(scalar: str) -> wp.Kernel:
+    """Kernel of :func:`pose_bodies`."""
     numbers = wp.array(dtype=getattr(wp, scalar))
 
     def pose_body(
@@ -131,7 +132,7 @@ def _pose_bodies(
         translation_stride, _flat(bind_world), bind_stride, int(scaled), _flat(stretch), scale_stride,
         as_warp(ints), as_warp(reals), _flat(world), _flat(joints), _flat(skin), _flat(active),
     ]  # fmt: skip
-    kernel = _body_kernel(scalar_name(rotations.dtype))
+    kernel = posing(scalar_name(rotations.dtype))
 
     def run(part: slice) -> None:
         with launching(rotations) as device:

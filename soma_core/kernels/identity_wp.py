@@ -11,7 +11,7 @@ from torch import Tensor
 from soma_core.geometry.torch_func import operator
 from soma_core.kernels._runtime import as_warp, launching, loaded, once, scalar_name
 
-__all__ = ["fitted_world", "to_bind_pose"]
+__all__ = ["fitted_world", "identity_kernels", "to_bind_pose"]
 
 _ids = wp.array(dtype=wp.int64)
 
@@ -47,7 +47,8 @@ def _functions(scalar: str, module: wp.Module) -> tuple[wp.Function, wp.Function
 
 
 @once
-def _kernels(scalar: str) -> SimpleNamespace:
+def identity_kernels(scalar: str) -> SimpleNamespace:
+    """Kernels of both functions, and their types."""
     real = getattr(wp, scalar)
     vec3, mat33 = wp.types.vector(3, real), wp.types.matrix((3, 3), real)
     mat44, mat34 = wp.types.matrix((4, 4), real), wp.types.matrix((3, 4), real)
@@ -99,7 +100,7 @@ def _kernels(scalar: str) -> SimpleNamespace:
 
 @operator("soma_core::fitted_world")
 def _fitted_world(displacement: Tensor, source: Tensor, bind_rotation: Tensor, joints: Tensor) -> Tensor:
-    kernels, batch, count = _kernels(scalar_name(joints.dtype)), len(joints), len(source)
+    kernels, batch, count = identity_kernels(scalar_name(joints.dtype)), len(joints), len(source)
     out = joints.new_empty(batch, count, 4, 4)
     if not out.numel():
         return out
@@ -122,7 +123,7 @@ def _(displacement, source, bind_rotation, joints):
 def _to_bind_pose(
     fitted: Tensor, parents: Tensor, bind_rotation: Tensor, parent_orient: Tensor, bind_parent_turn: Tensor
 ) -> tuple[Tensor, Tensor]:
-    kernels, (batch, count) = _kernels(scalar_name(fitted.dtype)), fitted.shape[:2]
+    kernels, (batch, count) = identity_kernels(scalar_name(fitted.dtype)), fitted.shape[:2]
     world, skin = fitted.new_empty(batch, count, 4, 4), fitted.new_empty(batch, count, 3, 4)
     if not world.numel():
         return world, skin

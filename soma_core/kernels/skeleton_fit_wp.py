@@ -16,13 +16,14 @@ from soma_core.geometry.torch_func import operator
 from soma_core.kernels._runtime import as_warp, launching, loaded, once, scalar_name
 from soma_core.kernels.rotation_functions_wp import bone_functions, kabsch_function
 
-__all__ = ["fit_displacements"]
+__all__ = ["displacing", "fit_displacements"]
 
 _ids, _table = wp.array(dtype=wp.int64), wp.array2d(dtype=wp.int64)
 
 
 @once
-def _displace(scalar: str) -> wp.Kernel:
+def displacing(scalar: str) -> wp.Kernel:
+    """Kernel of :func:`fit_displacements`."""
     module = wp.get_module(f"soma_skeleton_fit_{scalar}")
     types = _types(scalar)
     vec3, mat33 = types.vec3, types.mat33
@@ -265,7 +266,7 @@ def _fit(
         return out
     with launching(joints) as device:
         wp.launch(
-            loaded(_displace(scalar), device),
+            loaded(displacing(scalar), device),
             dim=tuple(out.shape[:2]),
             inputs=[as_warp(pivots), as_warp(children), as_warp(bind, types.vec3),
                     as_warp(joints, types.vec3), as_warp(covariances, types.mat33)],
