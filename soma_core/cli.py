@@ -250,6 +250,8 @@ _PYTHON_WARNING_TEXT = warnings.formatwarning
 
 def console() -> None:
     """Entry point of the console script."""
+    if "torch" not in sys.modules:  # whose threads otherwise wait awake, in the way of those of the kernels
+        os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     warnings.formatwarning = _warning_text
     if logging.lastResort:
         logging.lastResort.setFormatter(PrintableFormatter("%(message)s"))

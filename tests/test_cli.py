@@ -179,6 +179,22 @@ def test_a_reader_that_goes_away_ends_the_command_quietly(arguments: list[str]) 
     assert process.returncode == EXIT_PIPE
 
 
+@pytest.mark.parametrize(("given", "held"), [({}, "PASSIVE"), ({"OMP_WAIT_POLICY": "ACTIVE"}, "ACTIVE")])
+def test_threads_of_torch_do_not_wait_awake_unless_that_is_asked_for(given: dict, held: str) -> None:
+    """They begin when torch is imported."""
+    code = """
+import os, sys
+from soma_core import cli
+cli.main = lambda arguments: print(os.environ["OMP_WAIT_POLICY"], "torch" in sys.modules)
+cli.console()
+"""
+    kept = {name: value for name, value in os.environ.items() if name != "OMP_WAIT_POLICY"}
+    said = subprocess.run(
+        [sys.executable, "-c", code], env=kept | given, capture_output=True, text=True, check=True
+    )
+    assert said.stdout.split() == [held, "False"]
+
+
 def test_a_warning_about_a_backend_is_one_line(monkeypatch) -> None:
     monkeypatch.setattr(warnings, "formatwarning", warnings.formatwarning)
     monkeypatch.setattr(cli, "main", lambda arguments: EXIT_OK)
