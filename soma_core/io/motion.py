@@ -16,6 +16,10 @@ __all__ = ["Convention", "Motion"]
 Convention = Literal["t_pose_relative", "absolute_local"]
 
 
+_MOST_FPS = 10_000
+"""Frames per second that a motion may have; windows in seconds would have no end of frames."""
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Motion:
     """Joint rotations over time.
@@ -67,11 +71,11 @@ class Motion:
         self._check_recorded(frames)
         if frames == 0:
             raise InputError("rotations", got="0 frames", expected="at least one", fix="Give a longer clip.")
-        if not (np.isfinite(self.fps) and self.fps > 0):
+        if not 0 < self.fps <= _MOST_FPS:
             raise InputError(
                 "fps",
                 got=self.fps,
-                expected="a positive number",
+                expected=f"a positive number, at most {_MOST_FPS:,}",
                 fix="Give the frame rate in frames per second.",
             )
         if self.convention not in ("t_pose_relative", "absolute_local"):

@@ -327,7 +327,7 @@ def _spikes(values: np.ndarray, fps: float, least: float) -> np.ndarray:
     if len(values) < 5:
         return bad
     scores = [_sticking_out(values, length) for length in range(1, len(_SPANS) + 1)]
-    around = 2 * round(_AROUND * fps) + 1
+    around = min(2 * round(_AROUND * fps), 2 * len(values)) + 1
     usual = median_filter(scores[0], (around, 1), mode="mirror")
     over = [
         score > np.maximum(_RATIO * span * usual, least) for span, score in zip(_SPANS, scores, strict=True)

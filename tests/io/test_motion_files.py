@@ -174,6 +174,7 @@ def test_a_failed_write_leaves_the_old_file(motion, tmp_path, monkeypatch):
         ("unit", "inches", r"unit: got 'inches', expected 'meters'"),
         ("unit", "", r"unit: got no unit"),
         ("fps", 0.0, r"fps: got 0\.0"),
+        ("fps", 20001.0, r"fps: got 20001\.0, expected a positive number, at most 10,000"),
         ("fps", [24.0, 30.0], r"fps: got shape \(2,\), expected one number"),
         ("rotation_repr", "euler", r"rotation_repr: got 'euler'"),
         ("poses", np.zeros((5, 77, 3, 3)), r"poses: got a reflection at frame 0, joint 0"),
