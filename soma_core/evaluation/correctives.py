@@ -29,6 +29,7 @@ from soma_core.layer import SomaLayer
 from soma_core.paths import assets_dir
 from soma_core.progress import progress
 from soma_core.rig import load_canonical
+from soma_core.rig.manifest import shipped_file
 from soma_core.rig.mesh import CanonicalMesh
 from soma_core.rig.skeleton import Rig
 from soma_core.skeleton.identity import Identity
@@ -94,7 +95,7 @@ def _unseen(rig: Rig, count: int, files: list[str]) -> dict[str, np.ndarray]:
     names = rig.user_joint_names
     motions = {"random poses": random_rotations(names, count, random)}
     motions["random poses, arms hanging"] = random_rotations(names, count, random, hanging=True)
-    for path in (str(assets_dir() / "motions" / "range_of_motion.npz"), *files):
+    for path in (str(shipped_file("motions/range_of_motion.npz")), *files):
         rotations = read_motion(path).rotations
         frames = np.linspace(0, len(rotations) - 1, min(count, len(rotations))).astype(int)
         motions[path.rpartition("/")[2].removesuffix(".npz")] = rotations[frames].astype(np.float64)

@@ -20,7 +20,7 @@ from soma_core.evaluation.shipped_layers import LayerMaker
 from soma_core.geometry.rotations import axis_angle_to_matrix
 from soma_core.io import read_motion
 from soma_core.layer import SomaLayer
-from soma_core.paths import assets_dir
+from soma_core.rig.manifest import shipped_file
 
 __all__ = ["ANNY_IDENTITIES", "MovingMesh", "anny_meshes", "own_meshes"]
 
@@ -67,7 +67,7 @@ def own_meshes(count: int, seed: int, make: LayerMaker) -> Iterator[MovingMesh]:
     """
     anny, native = make("anny"), make("soma")
     yield from _smooth(anny, native, count, seed)
-    for path in (assets_dir() / "motions/range_of_motion.npz", *_recorded()):
+    for path in (shipped_file("motions/range_of_motion.npz"), *_recorded()):
         motion = read_motion(path)
         kept = np.unique(np.linspace(0, motion.frame_count - 1, count).astype(int))
         rotations, hips = torch.as_tensor(motion.rotations[kept]), torch.as_tensor(motion.translation[kept])

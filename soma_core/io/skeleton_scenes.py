@@ -23,6 +23,9 @@ _FPS = 30.0
 _MOST = 50_000_000
 """Joints times frames that are read at most: 4 GB of rotations."""
 
+_MOST_JOINTS = 4096
+"""As in BVH."""
+
 _CHUNK = 1 << 20
 
 
@@ -101,10 +104,17 @@ def joints_under(
         while above >= 0 and above not in joints:
             joints.add(above)
             above = int(parents[above])
+    if len(joints) > _MOST_JOINTS:
+        raise ValueError(f"it has {len(joints)} joints, more than {_MOST_JOINTS}")
     tops = sorted(joint for joint in joints if parents[joint] not in joints)
     if root is not None:
         tops = [joint for joint in sorted(joints) if names[joint] == root]
-    weights = {top: {joint for joint in joints if top in _upwards(parents, joint)} for top in tops}
+    weights: dict[int, set[int]] = {top: set() for top in tops}
+    above_each: dict[int, list[int]] = {}  # the tops at a joint and over it
+    for joint in by_depth(joints, parents):
+        above_each[joint] = above_each.get(int(parents[joint]), []) + [joint] * (joint in weights)
+        for top in above_each[joint]:
+            weights[top].add(joint)
     large = [top for top, below in weights.items() if len(below) > 2] or list(weights)
     if len(large) != 1:
         raise InputError(
@@ -116,19 +126,27 @@ def joints_under(
     return weights[large[0]]
 
 
-def _upwards(parents: np.ndarray, joint: int) -> Iterator[int]:
-    while joint >= 0:
-        yield joint
-        joint = int(parents[joint])
-
-
-def _depth(parents: np.ndarray, joint: int) -> int:
-    return sum(1 for _ in _upwards(parents, joint))
+def _depths(parents: np.ndarray) -> list[int]:
+    """How many nodes are over each, in one walk over all of them."""
+    above, depths = parents.tolist(), [-1] * len(parents)
+    for joint in range(len(above)):
+        way = []
+        while joint >= 0 and depths[joint] < 0:
+            way.append(joint)
+            if len(way) > len(above):
+                raise ValueError("its joints hang on each other in a circle")
+            joint = above[joint]
+        over = depths[joint] if joint >= 0 else -1
+        for each in reversed(way):
+            over += 1
+            depths[each] = over
+    return depths
 
 
 def by_depth(joints: Iterable[int], parents: np.ndarray) -> list[int]:
     """Joints with parents before children."""
-    return sorted(joints, key=lambda joint: (_depth(parents, joint), joint))
+    depths = _depths(parents)
+    return sorted(joints, key=lambda joint: (depths[joint], joint))
 
 
 def among(order: Sequence[int], parents: np.ndarray) -> np.ndarray:
@@ -172,7 +190,7 @@ def _node_rest(nodes: Sequence[dict[str, Any]], parents: np.ndarray) -> np.ndarr
     from scipy.spatial.transform import Rotation
 
     worlds = np.tile(np.eye(4), (len(nodes), 1, 1))
-    for index in sorted(range(len(nodes)), key=lambda joint: _depth(parents, joint)):
+    for index in by_depth(range(len(nodes)), parents):
         node, local = nodes[index], np.eye(4)
         if "matrix" in node:
             local = np.reshape(node["matrix"], (4, 4)).T

@@ -278,6 +278,10 @@ def _scenes() -> Iterator[tuple[str, bytes]]:
         "children out of range": {"nodes": [{"mesh": 0, "children": [7]}]},
         "many nodes": {"nodes": [{"mesh": 0}, *[{}] * 200_000]},
         "nodes that are text": {"nodes": "abc"},
+        "a chain of many joints": {
+            "nodes": [*({"children": [child]} for child in range(1, 30_000)), {"mesh": 0}],
+            "skins": [{"joints": [*range(30_000)]}],
+        },
     }
     for name, change in changes.items():
         yield f"glb of {name}", glb_bytes(document | change, bytes(24))
