@@ -25,7 +25,10 @@ _LONGEST = 600
 
 
 def _told(found: object) -> str:
+    """What was found, for a terminal: no control characters, no halves of letters, and not too long."""
     text = str(found)
+    if not text.isprintable():
+        text = "".join(each if each.isprintable() or each == "\n" else ascii(each)[1:-1] for each in text)
     if len(text) <= _LONGEST:
         return text
     return f"{text[: _LONGEST // 2]} ... ({len(text)} letters) ... {text[-_LONGEST // 4 :]}"

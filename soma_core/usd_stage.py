@@ -18,7 +18,7 @@ from soma_core.json_file import parse_json
 if TYPE_CHECKING:
     from pxr import Usd
 
-__all__ = ["open_stage", "usd_errors"]
+__all__ = ["metres_of", "open_stage", "usd_errors"]
 
 _MOST_PLAIN = 32 * 2**20
 """Bytes of text that are looked through here; longer ones are opened in a process of their own first."""
@@ -72,6 +72,21 @@ def usd_errors(path: Path, *, fix: str) -> Iterator[None]:
     except (RuntimeError, TypeError, ValueError, IndexError, AttributeError, OverflowError) as error:
         # Tf.ErrorException is a RuntimeError with lines of C++.
         raise AssetError(path, cause=f"USD cannot read it ({_last_line(error)})", fix=fix) from error
+
+
+def metres_of(path: Path, stage: Usd.Stage) -> float:
+    """Metres of a unit of a stage.
+
+    Raises:
+        AssetError: none that a length can have.
+    """
+    from pxr import UsdGeom
+
+    unit = float(UsdGeom.GetStageMetersPerUnit(stage))
+    if not 0 < unit < np.inf:
+        cause = f"metersPerUnit is {unit:g}, expected a positive number"
+        raise AssetError(path, cause=cause, fix="Export it again")
+    return unit
 
 
 def _last_line(error: Exception) -> str:

@@ -88,4 +88,6 @@ def test_what_is_quoted_in_an_error_is_cut() -> None:
     assert len(str(error)) < 1000
     assert "(5000 letters)" in str(error)
     assert len(error.got) == 5000
+    strange = InputError("joint", got="\x1b[2JHips\ud800", expected="a name", fix="Rename it.")
+    assert str(strange) == r"joint: got \x1b[2JHips\ud800, expected a name. Rename it."
     assert len(str(AssetError("a.json", cause="schema is " + "9" * 5000, fix="Write it again."))) < 1000

@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from soma_core.io.pickled_arrays import bytes_of
 from soma_core.pickle_machine import (
     STORED,
     Global,
@@ -166,7 +167,7 @@ def array_text(record: Record) -> np.ndarray | None:
     if type(dtype) is not Record or type(dtype.arguments[0]) is not str or dtype.arguments[0][:1] not in "US":
         return None
     kind, size = item_of(dtype)
-    data = state[3].encode("latin-1") if type(state[3]) is str else bytes(state[3])
+    data = bytes_of(state[3])
     if not size or len(data) % size:
         raise ValueError("text of a damaged length")
     order = dtype.state[1] if type(dtype.state) is tuple and dtype.state[1] in ("<", ">") else "="

@@ -19,7 +19,7 @@ from soma_core.pickle_machine import Global, Record
 from soma_core.safe_pickle import read_pickle
 from soma_core.stored_matrix import StoredMatrix
 
-__all__ = ["RecordArrays", "read_pickled_arrays"]
+__all__ = ["RecordArrays", "bytes_of", "read_pickled_arrays"]
 
 _PLAIN_DTYPE = re.compile(r"[fiub][1248]")
 _DEEPEST = 8
@@ -129,7 +129,7 @@ class RecordArrays:
 
     def _numpy_array(self, shape: Any, dtype: Any, fortran: Any, data: Any) -> np.ndarray:
         self._spend(len(data.arguments[0]) if type(data) is Record else len(data))
-        kind, content = _dtype(dtype), _buffer(data)
+        kind, content = _dtype(dtype), bytes_of(data)
         sizes = _shape(shape)
         if math.prod(sizes) * kind.itemsize != len(content):
             raise ValueError(f"{len(content)} bytes for the shape {sizes} of {kind}")
@@ -181,7 +181,12 @@ def _dtype(value: Any) -> np.dtype:
     return np.dtype(name).newbyteorder(order if order in ("<", ">", "|") else "=")  # type: ignore[arg-type]
 
 
-def _buffer(data: Any) -> bytes | memoryview:
+def bytes_of(data: Any) -> bytes | memoryview:
+    """Bytes of an array in a pickle, of whatever Python wrote it.
+
+    Raises:
+        ValueError: something else.
+    """
     if type(data) is Record and data.function == Global("_codecs", "encode"):
         data = data.arguments[0]  # bytes as Python 3 writes them for Python 2: text of Latin-1
     if type(data) is str:

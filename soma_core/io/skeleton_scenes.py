@@ -14,7 +14,7 @@ from soma_core.io.glb_animation import NodeTracks
 from soma_core.io.glb_file import GlbFile
 from soma_core.io.joint_order import USER_JOINTS
 from soma_core.io.skeleton_motion import SkeletonMotion, skeleton_of_worlds
-from soma_core.usd_stage import open_stage, usd_errors
+from soma_core.usd_stage import metres_of, open_stage, usd_errors
 
 __all__ = ["DAMAGE", "among", "by_depth", "joints_under", "read_glb_skeleton", "read_usd_skeleton"]
 
@@ -271,7 +271,7 @@ def _usd(stage: Any, path: Path, fps: float | None, root: str | None) -> Skeleto
     times, rate = _times(samples / per_second, fps)
     _check_size(path, len(times) * len(names))
     still = not len(samples)
-    metres, place = UsdGeom.GetStageMetersPerUnit(stage), UsdGeom.XformCache()
+    metres, place = metres_of(path, stage), UsdGeom.XformCache()
     worlds = np.empty((len(times), len(names), 4, 4))
     for frame, time in enumerate(times):
         code = Usd.TimeCode.Default() if still else Usd.TimeCode(time * per_second)

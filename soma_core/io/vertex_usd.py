@@ -9,7 +9,7 @@ import numpy as np
 
 from soma_core.errors import AssetError, InputError
 from soma_core.io.vertex_sequence import VertexSequence, even_rate
-from soma_core.usd_stage import open_stage, usd_errors
+from soma_core.usd_stage import metres_of, open_stage, usd_errors
 
 __all__ = ["UsdSequence"]
 
@@ -42,7 +42,7 @@ class UsdSequence(VertexSequence):
             len(self._times),
             len(self._points.GetPointsAttr().Get(self._times[0]) or ()),
             fps=even_rate(path, np.array(self._times) / rate),
-            metres=UsdGeom.GetStageMetersPerUnit(self._stage),
+            metres=metres_of(path, self._stage),
             up="+z" if UsdGeom.GetStageUpAxis(self._stage) == UsdGeom.Tokens.z else "+y",
         )
 

@@ -125,7 +125,7 @@ def write_products(
         products: which, of `WRITERS`.
         place: where each goes.
         options: how.
-        picture: of the contact sheet; none is drawn of no frames.
+        picture: of the contact sheet.
 
     Returns:
         Name of each product and where it was written.
@@ -136,12 +136,11 @@ def write_products(
     options, wanted, written = options or WriteOptions(), set(products), {}
     turned = replace(played, up=f"+{options.write_up or 'y'}")
     made: dict[str, tuple[Any, ...]] = {}
-    picture = picture or Picture()
     for product, writer in WRITERS.items():
-        if product not in wanted or (writer.needs == "pictures" and not picture.frames):
+        if product not in wanted:
             continue
         if writer.needs not in made:
-            made[writer.needs] = _NEEDED[writer.needs](played, turned, options, picture)
+            made[writer.needs] = _NEEDED[writer.needs](played, turned, options, picture or Picture())
         writer.write(place(product), *made[writer.needs])
         written[str(product)] = place(product)
     return written

@@ -19,7 +19,7 @@ from soma_core.rig.procedural import ProceduralDefinition
 from soma_core.rig.skeleton import Rig
 from soma_core.rig.stored import StoredRig
 from soma_core.rig.transforms import world_transforms
-from soma_core.usd_stage import open_stage, usd_errors
+from soma_core.usd_stage import metres_of, open_stage, usd_errors
 
 if TYPE_CHECKING:
     from pxr import Usd, UsdSkel
@@ -245,7 +245,7 @@ def _read_stored(path: Path, stage: Usd.Stage, skin: Usd.Prim) -> StoredRig:
         t_pose_world=skeleton.t_pose_world,
         bind_shape=points,
         weights=read_weights(path, skin, skeleton.joint_paths, len(points)),
-        unit=float(UsdGeom.GetStageMetersPerUnit(stage)),
+        unit=metres_of(path, stage),
         up=up,
     )
 

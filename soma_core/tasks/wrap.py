@@ -30,6 +30,9 @@ __all__ = ["run"]
 
 _log = logging.getLogger(__name__)
 
+_DIGITS = 19
+"""Of a vertex id."""
+
 _AXES = ("+x", "-x", "+y", "-y", "+z", "-z")
 
 
@@ -138,7 +141,7 @@ def read_landmarks(name: str | Path) -> dict[int, int]:
     expected = '{"LeftIndexTip or a canonical vertex id": native vertex id}'
     found = _json(name, dict, expected)
     names = canonical_landmarks()
-    unknown = [key for key in found if key not in names and not key.isdecimal()]
+    unknown = [key for key in found if key not in names and not (key.isdecimal() and len(key) < _DIGITS)]
     if unknown:
         raise InputError(
             f"landmarks {name}",

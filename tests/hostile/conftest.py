@@ -70,6 +70,7 @@ def ask(tmp_path_factory) -> Iterator[Callable[[str, str], str | None]]:
         assert not found["events"], f"{name} led to {found['events']}"
         told = found["told"]
         assert not (told or "").startswith("FOREIGN"), f"{name}: {told}"
+        assert (told or "").replace("\n", "").isprintable(), f"{name} reaches the terminal: {told!a}"
         assert len(told or "") < MOST_LETTERS, f"{name} is told in {len(told)} letters"
         assert found["seconds"] < MOST_SECONDS, f"{name} took {found['seconds']:.1f} s of computing"
         assert found["bytes"] < MOST_MEMORY, f"{name} took {found['bytes'] >> 20} MiB"

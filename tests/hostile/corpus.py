@@ -305,6 +305,7 @@ def _scenes() -> Iterator[tuple[str, bytes]]:
         ("a huge element size", "elementSize = 1", "elementSize = 1000000000"),
         ("an element size of zero", "elementSize = 1", "elementSize = 0"),
         ("no text", "def SkelRoot", "def SkelRoot \x00"),
+        ("a unit of NaN", "metersPerUnit = 0.01", "metersPerUnit = nan"),
     ):
         assert old in USD
         yield f"usda of {name}", USD.replace(old, new).encode()
@@ -381,6 +382,8 @@ def _plain() -> Iterator[tuple[str, bytes]]:
     yield "deep JSON", b"[" * 200_000
     yield "JSON of another kind", b'{"schema": 1, "files": 3}'
     yield "JSON of a list", b"[1, 2]"
+    yield "JSON of a key of many digits", b'{"' + b"9" * 5000 + b'": 1}'
+    yield "JSON of half a letter", b'{"\\ud800\\u001b[2J": 1}'
     yield "invalid UTF-8", b'{"schema": "\xff\xfe"}'
     yield "csv of one long line", b"1," * 2_000_000
     yield "csv of a long cell", b"a_x,a_y,a_z\n" + b"1" * 200_000
