@@ -162,7 +162,7 @@ def no_own_gradient(context: Context) -> None:
 @check(
     "another-process",
     mend="name files from `Path(__file__).parent`; end what was started; keep nothing",
-    needs=("deterministic", "batch-invariant"),
+    needs=("deterministic", "batch-invariant", "inputs-unchanged"),
 )
 def another_process(context: Context) -> None:
     """A new process elsewhere makes the same bodies and ends; the package stays as it is."""
