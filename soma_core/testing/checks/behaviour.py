@@ -12,15 +12,15 @@ from soma_core.plugin.checks import CheckFailedError, check
 from soma_core.plugin.spec import Generator, HasLinearBasis
 from soma_core.testing.context import Context
 from soma_core.testing.global_state import changes, snapshot
-from soma_core.testing.process_probe import probe_process
+from soma_core.testing.process_probe import KEPT, probe_process
 
 __all__ = ["CHECKS"]
 
 _SAME_M = 1e-9
 """Metres. The same float64 sums in another order, on bodies of two metres."""
 
-_BODIES, _KEPT = 8, 0.5
-"""Bodies that another process makes, and the share of their bytes that a call may leave: less is noise."""
+_BODIES = 8
+"""Bodies that another process makes."""
 
 
 def _rest(generator: Generator, params: Mapping[str, Tensor]) -> Tensor:
@@ -186,7 +186,7 @@ def another_process(context: Context) -> None:
     if probe.ending:
         fix = "End threads and processes before, or make them daemons; let no exit handler end the process."
         raise CheckFailedError(where, got=probe.ending, expected="an end with exit code 0", fix=fix)
-    if probe.growth > _KEPT * probe.bodies.nbytes:
+    if probe.growth > KEPT * probe.bodies.nbytes:
         raise CheckFailedError(
             f"memory of {where}",
             got=f"{probe.growth / 2**20:.1f} MiB more after each call of rest()",
