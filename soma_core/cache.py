@@ -17,7 +17,7 @@ import numpy as np
 
 from soma_core.errors import AssetError, InputError, SomaError
 from soma_core.npz import open_npz_file
-from soma_core.paths import cache_dir
+from soma_core.paths import cache_dir, fitting
 
 __all__ = [
     "UnwritableError", "atomic_arrays", "atomic_folder", "atomic_text", "atomic_write", "cached_arrays",
@@ -52,6 +52,10 @@ def content_key(*parts: object) -> str:
     return digest.hexdigest()[:32]
 
 
+_SUFFIX = 20
+"""Characters of a suffix at most, beyond which a name merely has a dot in it."""
+
+
 class UnwritableError(SomaError, OSError):
     """A file or folder cannot be written: no room, no right to, or something in its place."""
 
@@ -75,8 +79,9 @@ def atomic_write(path: Path, write: Callable[[Path], object]) -> None:
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         _sweep(path.parent)
-        prefix = f".{path.stem[:100]}{_mark()}{os.getpid()}-"
-        handle, name = tempfile.mkstemp(dir=path.parent, prefix=prefix, suffix=path.suffix)
+        prefix = f".{fitting(path.stem, longest=100)}{_mark()}{os.getpid()}-"
+        suffix = path.suffix if len(path.suffix) <= _SUFFIX else ""
+        handle, name = tempfile.mkstemp(dir=path.parent, prefix=prefix, suffix=suffix)
         os.close(handle)
         temporary = Path(name)
         write(temporary)

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import hashlib
 import os
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 
 from soma_core.errors import InputError
 
@@ -14,6 +15,7 @@ __all__ = [
     "configs_dir",
     "data_dir",
     "expanded",
+    "fitting",
     "model_folders",
     "shipped_assets",
 ]
@@ -30,6 +32,27 @@ def expanded(path: str | os.PathLike[str]) -> Path:
         return path.expanduser()
     except RuntimeError:  # ~name of nobody on this machine: a file that is yet to be written
         return path
+
+
+_LONGEST = 200
+"""Bytes of the name of a file; systems take 255, and names of results are longer by up to 50."""
+
+
+def fitting(name: str, *, longest: int = _LONGEST) -> str:
+    """A relative path whose parts are short enough for a file system; what is cut has a digest in its place.
+
+    Args:
+        name: parts divided by ``/``.
+        longest: bytes of a part.
+    """
+    parts = []
+    for part in name.split("/"):
+        told, suffix = os.fsencode(part), PurePosixPath(part).suffix
+        if len(told) > longest:
+            end = "-" + hashlib.sha256(told).hexdigest()[:12] + (suffix if len(suffix) <= 12 else "")
+            part = told[: longest - len(os.fsencode(end))].decode(errors="ignore") + end
+        parts.append(part)
+    return "/".join(parts)
 
 
 def _shipped(name: str) -> Path:

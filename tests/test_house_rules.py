@@ -51,6 +51,8 @@ RANKS = [
         "npz",
         "obj",
         "options",
+        "parquet_file",
+        "parquet_probe",
         "paths",
         "pickle_machine",
         "progress",

@@ -13,8 +13,8 @@ import numpy as np
 
 from soma_core._lazy import needed
 from soma_core.errors import AssetError, InputError
-from soma_core.files import refuse_unreadable
 from soma_core.io.npz_fields import NpzFields, open_npz
+from soma_core.parquet_file import look_through
 from soma_core.paths import expanded
 from soma_core.plugin.spec import Unit
 from soma_core.topology.frames import METRES
@@ -134,7 +134,7 @@ def _frames(fields: NpzFields, key: str) -> np.ndarray:
 
 
 def _read_parquet(path: Path) -> dict[str, np.ndarray]:
-    refuse_unreadable(path, fix="Give a complete .parquet file.")
+    look_through(path)
     pa = needed("pyarrow", "parquet", setting=path, pip="[parquet]")
     try:
         with pa.parquet.ParquetFile(path) as file:

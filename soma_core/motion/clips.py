@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import json
 import os
+import re
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path, PurePosixPath
@@ -22,6 +23,7 @@ from soma_core.motion.folder import Outcome, converters_of, outcome
 from soma_core.motion.options import DatasetOptions
 from soma_core.npz import open_npz_file
 from soma_core.options import Picture
+from soma_core.paths import fitting
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -167,7 +169,7 @@ def clip_file(row: Mapping[str, Any], name: str, folder: Path) -> tuple[str, Pat
     texts = [row[key][0].as_py() for key in _NAMES if key in row]
     own = next((text for text in texts if isinstance(text, str) and text), "")
     name = "/".join(filter(None, (name, own))) or "clip"
-    stem = PurePosixPath(own).name or "clip"
+    stem = fitting(re.sub(r"[\x00-\x1f\\]", "_", PurePosixPath(own).name).strip(".") or "clip")
     if "bytes" in row:
         content, path = row["bytes"][0].as_py() or b"", folder / stem
         atomic_write(path, lambda place: place.write_bytes(content))
@@ -234,7 +236,7 @@ def row_tables(
         name, file = clip_file(columns, name, work / "source")
     except UnwritableError:
         raise
-    except (SomaError, ValueError, TypeError) as error:
+    except Exception as error:  # one row never ends a batch
         yield from refused(name, error, rows)
         return
     yield from clips(file, name, work, rows, file_sha256(file))

@@ -21,7 +21,7 @@ from soma_core.motion.poses import POSES, named_pose
 from soma_core.motion.questions import Names, of_motion, say
 from soma_core.motion.smpl_input import SMPL_LAYOUTS
 from soma_core.options import FrameRange, ModelOptions, Picture
-from soma_core.paths import expanded
+from soma_core.paths import expanded, fitting
 from soma_core.rig.manifest import shipped_file
 
 __all__ = [
@@ -194,7 +194,9 @@ def people_names(source: Path) -> dict[str, str]:
             f"{source}: person", got="all, of a file without people to choose from",
             expected="one of the SMPL family, of GEM-X or kimodo", fix="Leave person out.",
         )  # fmt: skip
-    names = {person: re.sub(r"[^\w.-]+", "_", person).strip(".") or "person" for person in people}
+    names = {
+        person: fitting(re.sub(r"[^\w.-]+", "_", person).strip(".") or "person") for person in people
+    }
     taken = dict.fromkeys(names.values())
     return (
         names

@@ -22,7 +22,8 @@ from soma_core.io.skeleton_files import SKELETON_SUFFIXES
 from soma_core.io.smpl_bodies import shown_names
 from soma_core.io.smpl_files import smpl_layout
 from soma_core.motion.writers import WRITERS
-from soma_core.paths import expanded
+from soma_core.parquet_file import look_through
+from soma_core.paths import expanded, fitting
 from soma_core.plugin.declaration import motion_problem
 from soma_core.plugin.errors import PluginError
 from soma_core.plugin.registry import default_registry
@@ -77,7 +78,11 @@ class ResultFiles:
 
     @classmethod
     def mirrored(cls, folder: Path, name: str) -> ResultFiles:
-        """Those of the file `name` of a folder: ``motions``, ``reports`` and so on mirror it."""
+        """Those of the file `name` of a folder: ``motions``, ``reports`` and so on mirror it.
+
+        A name that leaves no room for what is added to it is cut.
+        """
+        name = fitting(name)
         if not name.lower().endswith(".npz"):
             name = f"{name}.npz"
         report = folder / "reports" / name
@@ -161,6 +166,7 @@ def _known_layout(path: Path) -> Layout | None:
     """The layout of those that the core knows."""
     suffix = path.suffix.lower()
     if suffix == ".parquet":
+        look_through(path)
         return "sam3d"
     if suffix in SKELETON_SUFFIXES:
         return "skeleton"

@@ -25,7 +25,7 @@ from soma_core.motion.converter import Converted, Converter
 from soma_core.motion.engines import run_job, usual_workers
 from soma_core.motion.files import ResultFiles, layout_of, motion_suffixes, no_motion
 from soma_core.motion.options import ConvertOptions, DatasetOptions
-from soma_core.paths import expanded
+from soma_core.paths import expanded, fitting
 
 __all__ = [
     "FolderConverted", "FolderJob", "Outcome", "convert_folder", "converters_of",
@@ -157,8 +157,8 @@ class FolderJob:
         def do(name: str) -> list[Outcome]:
             file = self.folder / name
             return [
-                outcome(converter, file, ResultFiles.mirrored(self.out, one), self.out / "chunks" / one, one,
-                        run=self.run)
+                outcome(converter, file, ResultFiles.mirrored(self.out, one),
+                        self.out / "chunks" / fitting(one), one, run=self.run)
                 for one, converter in converters_of(convert, file, name, self.options)
             ]  # fmt: skip
 

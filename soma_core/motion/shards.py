@@ -22,6 +22,7 @@ from soma_core.motion.engines import need_ray, pool_settings, run_job
 from soma_core.motion.files import motion_suffixes
 from soma_core.motion.folder import is_one_motion, motion_paths
 from soma_core.motion.options import ConvertOptions, DatasetOptions
+from soma_core.parquet_file import look_through
 from soma_core.paths import expanded
 from soma_core.progress import progress
 from soma_core.rig import load_canonical
@@ -158,13 +159,12 @@ def clip_count(file: Path) -> int | None:
     """Rows of a Parquet file of clips; None for other files: frames of one person are a file as any other."""
     if file.suffix.lower() != ".parquet" or not file.is_file():
         return None
-    pa = need_pyarrow()
+    need_pyarrow()
     try:
-        with pa.parquet.ParquetFile(file) as stored:
-            framed = "pred_vertices" in stored.schema_arrow.names
-            return None if framed else stored.metadata.num_rows
-    except (pa.ArrowException, OSError):
+        names, rows = look_through(file)
+    except AssetError:
         return None  # said when it is converted
+    return None if "pred_vertices" in names else rows
 
 
 def _finished(job: ShardJob, number: int, entries: Sequence[Entry]) -> bool:
@@ -296,7 +296,7 @@ class _Shard:
                     yield from row_tables(self.clips, columns, f"{name}/{row}", place / str(row), rows)
             except UnwritableError:
                 raise
-            except (need_pyarrow().ArrowException, OSError) as error:
+            except Exception as error:  # what pyarrow raises of a damaged file is of many kinds
                 yield from refused(f"{name}/{start}-{stop}", error, rows)
 
 

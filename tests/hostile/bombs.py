@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import functools
 import io
 import json
@@ -9,6 +10,7 @@ import pickle
 import struct
 import warnings
 import zipfile
+import zlib
 from collections.abc import Callable, Iterator
 
 import numpy as np
@@ -321,6 +323,38 @@ def _several_bombs(frames: int) -> bytes:
     return stream.getvalue()
 
 
+_LIST_BOMB = (
+    b"c-nnZO-sW-5S^?c=AfX$gseoU2SbIbRjG=oF!dW-YzuzWi<B5@v8^$!20i(w{0Cn2m*_=2dQsfnrfM&~!%k-By*E3XEl_C|b"
+    b"u@7_hYVo^Ao(!!nb5~U0RfjWm%{t!hc^v}&_Khnby-pCy#>iX+3+yL`mt94QzU&~?@vOh8L})r`ZN^)b)L(BZM3{|zfnO38D"
+    b"<X#p?`LI<A?2<=eNXhjNFRQWprDw*II2sLUV%I{eInV_{}z0j62+M!9kN}z!>67y$(v%W#fRQI$MvL^`g0JuKE8UJSDCLWKR"
+    b"%tGgz5)*_WJ!Z*^x8QMxhL6pp|hdw@!%{iEg1O!kL1Be6&lMe1OWD57kYwuq{<UR8V9EKy#5tP}03jo&D+`Lo;>gkL1xqJ!A"
+    b"1YptltgwisNyvE_h@%%~MYnFoY+~HkJ+Kl-{$`)n6Z6c30ev2Ix^NO_7bM&~$c0GM^Bzu%&eL1dn)vK#uCxS|Nb?vvOydapW"
+    b"gyChB5PzjryKE-r7N*nFv)pmS^%)GHAYR}%yu_M%"
+)
+"""One row of Parquet with a list of 250,000,000 zeros, 646 bytes: deflated, in base 85."""
+
+
+def _parquet(**columns: object) -> bytes:
+    import pyarrow as pa
+    from pyarrow import parquet
+
+    stream = io.BytesIO()
+    parquet.write_table(pa.table(columns), stream, compression="zstd")
+    return stream.getvalue()
+
+
+def _tables() -> Iterator[tuple[str, bytes | Callable[[], bytes]]]:
+    yield "parquet of a list without end", zlib.decompress(base64.b85decode(_LIST_BOMB))
+    yield "parquet of more rows than bytes", lambda: _parquet(name=[None] * 2_000_000)
+    yield "parquet of many columns", lambda: _parquet(**{f"c{n}": [1.0] for n in range(12_000)})
+    yield "parquet of a footer before its begin", b"PAR1" + bytes(99) + struct.pack("<I", 2**31 - 1) + b"PAR1"
+    yield "parquet of no footer", b"PAR1" + bytes(99) + struct.pack("<I", 0) + b"PAR1"
+    deep: object = 1.0
+    for _ in range(150):
+        deep = [deep]
+    yield "parquet of lists in lists", lambda: _parquet(pred_vertices=[deep])
+
+
 def made() -> Iterator[tuple[str, bytes | Callable[[], bytes]]]:
     """Name -> content, or what makes it."""
     yield from _pickles()
@@ -329,6 +363,7 @@ def made() -> Iterator[tuple[str, bytes | Callable[[], bytes]]]:
     yield from _layers()
     yield from _far()
     yield from _archives()
+    yield from _tables()
     yield "JSON of many brackets", lambda: b"[" + b"[]," * 2_700_000 + b"[]]"
     texture = "ply\nformat ascii 1.0\ncomment TextureFile /dev/zero\nelement vertex 3\nproperty float x\n"
     texture += "property float y\nproperty float z\nelement face 1\nproperty list uchar int vertex_indices\n"

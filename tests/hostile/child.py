@@ -21,13 +21,14 @@ from soma_core.errors import SomaError
 from tests.hostile.corpus import FILES, LINKS, SENTINEL
 from tests.hostile.readers import READERS
 
+_PROBES = {f"soma_core.{kind}_probe" for kind in ("usd", "fbx", "parquet")}
 _EVENTS = ("os.system", "os.exec", "pickle.find_class")
 BY_NAME = {reader.name: reader for reader in READERS}
 _watched: list[str] = []
 
 
 def _audit(event: str, arguments: tuple) -> None:
-    ours = event == "subprocess.Popen" and {"soma_core.usd_probe", "soma_core.fbx_probe"} & {*arguments[1]}
+    ours = event == "subprocess.Popen" and _PROBES & {*arguments[1]}
     if event in _EVENTS or (event == "subprocess.Popen" and not ours):
         _watched.append(event)
 

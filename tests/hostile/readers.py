@@ -10,6 +10,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.parquet
 import torch
 from soma_backend_garment import _point_pca as garment
 from soma_backend_smpl._model_file import read_model
@@ -29,6 +31,7 @@ from soma_core.io.sam3d import read_sam3d
 from soma_core.io.skeleton_files import read_skeleton
 from soma_core.io.smpl_camera import in_world
 from soma_core.obj import read_obj
+from soma_core.parquet_file import look_through
 from soma_core.rig.manifest import MANIFEST_NAME, read_manifest
 from soma_core.rig.neutral import load_shape_space, read_topology
 from soma_core.rig.procedural_json import read_procedural
@@ -256,6 +259,11 @@ def _bvh(path: Path) -> None:
     path.write_text(f"{head}{leg}\n }}\n}}\nMOTION\nFrames: 2\nFrame Time: 0.04\n" + "0 90 0 1 2 3 4\n" * 2)
 
 
+def _parquet(path: Path) -> None:
+    rows = pa.table({"name": ["a", "b"], "poses": [_vertices().tolist()] * 2, "bytes": [b"a", None]})
+    pa.parquet.write_table(rows, path, compression="zstd")
+
+
 def _points(path: Path) -> np.ndarray:
     return read_points(path, ("Hips", "Head")).positions
 
@@ -360,6 +368,8 @@ READERS = [
     Reader(name="points of frames", suffix=".json", read=_points, good=_keypoints),
     Reader(name="camera of tracks", suffix=".npy", read=_camera, good=_camera_path),
     Reader(name="sam 3d body", suffix=".npz", read=read_sam3d),
+    Reader(name="parquet", suffix=".parquet", read=look_through, good=_parquet, apart=True),
+    Reader(name="sam 3d body in rows", suffix=".parquet", read=read_sam3d),
     Reader(name="shape space", suffix=".npz", read=load_shape_space, good=_shape_space),
     Reader(
         name="shape space header", suffix=".npz", read=component_count, good=_shape_space,

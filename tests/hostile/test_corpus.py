@@ -30,7 +30,7 @@ FOR_ALL = (
 
 COSTLY = re.compile(
     "usda of (very )?(deep|doubled)|JSON of many|pt (compressed|of many)|glb of many nodes"
-    "|pickle of (deep records|keys that collide|a wide text|endless)"
+    "|parquet of (a list|more|many)|pickle of (deep records|keys that collide|a wide text|endless)"
 )
 """Files that take long, and that one function refuses for all readers of the format: read by one of them.
 
@@ -40,7 +40,7 @@ All others of the format are read by each of its readers, which shows that they 
 
 def files_for(reader):
     """Hostile files of the reader's own format, those of no format, and some of others."""
-    kinds = {*KINDS.values(), "npz", "obj", "ply", "glb", "usda", "usdc", "bvh", "fbx", "csv"} - {
+    kinds = {*KINDS.values(), "npz", "obj", "ply", "glb", "usda", "usdc", "bvh", "fbx", "csv", "parquet"} - {
         KINDS.get(reader.suffix, reader.suffix[1:])
     }
     first = next(other for other in READERS if other.suffix == reader.suffix) is reader

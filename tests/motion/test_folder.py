@@ -104,6 +104,16 @@ def test_what_is_no_file_is_a_row_with_a_reason(tmp_path):
     assert "is a pipe, not a file" in rows["pipe.npz"]["reason"]
 
 
+@pytest.mark.parametrize("name", ["a" * 251, "走" * 83])
+def test_a_long_name_leaves_room_for_those_of_results(tmp_path, name):
+    (tmp_path / "in").mkdir()
+    write_motion(motion(), tmp_path / f"in/{name}.npz")
+    found = convert_folder(tmp_path / "in", tmp_path / "out")
+    assert not found.errors
+    (file,) = (tmp_path / "out/motions").iterdir()
+    assert file.name.startswith(name[:60])
+
+
 def test_one_file_without_anything_left_on_disk(tmp_path):
     given = motion()
     write_motion(given, tmp_path / "m.npz")

@@ -22,6 +22,7 @@ from soma_core.motion import DatasetOptions, clips, convert_folder, convert_shar
 from soma_core.motion.converter import Converted
 from soma_core.motion.files import ResultFiles
 from soma_core.paths import assets_dir
+from tests.hostile.corpus import FILES
 from tests.motion.test_converter import motion
 
 pa = pytest.importorskip("pyarrow")
@@ -248,6 +249,42 @@ def test_damaged_and_ragged_parquet_are_failed_rows(tmp_path, here):
     found = convert_shards(tmp_path / "in", tmp_path / "out", options=options())
     assert found.counts == {"failed": 3}
     assert "poses: got lists of 2 lengths" in found.failed["ragged.parquet/0"]
+
+
+def test_names_of_rows_are_no_paths(data, tmp_path, here):
+    """Too long, upwards, with a NUL: a clip like any other, whose file is called otherwise."""
+    names = [
+        "x" * 300 + ".npz",
+        "走" * 90 + ".npz",
+        "x/" * 3000,
+        "../../up.npz",
+        "..",
+        "a\0b.npz",
+        " ",
+        "last.npz",
+    ]
+    table = pa.table({"name": names, "bytes": [(data / "a.npz").read_bytes()] * len(names)})
+    pq.write_table(table, tmp_path / "clips.parquet")
+    found = convert_shards(tmp_path / "clips.parquet", tmp_path / "out", options=options())
+    assert found.counts == {"converted": len(names)}
+    assert not (tmp_path / "up.npz").exists()
+
+
+def test_a_row_of_which_nobody_foresaw_what_is_wrong_ends_nothing(data, tmp_path, here, monkeypatch):
+    def failing(*_):
+        raise RecursionError("too deep")
+
+    monkeypatch.setattr(clips, "clip_file", failing)
+    table = pa.table({"name": ["a", "b"], "bytes": [b"", b""]})
+    pq.write_table(table, tmp_path / "clips.parquet")
+    found = convert_shards(tmp_path / "clips.parquet", tmp_path / "out", options=options())
+    assert found.counts == {"failed": 2}
+
+
+def test_parquet_that_unfolds_without_end_is_a_failed_file(data, tmp_path, here):
+    (data / "bomb.parquet").write_bytes(FILES["parquet of a list without end"])
+    found = convert_shards(data, tmp_path / "out", options=options())
+    assert "more memory than its size can mean" in found.failed["bomb.parquet"]
 
 
 @pytest.mark.parametrize(
