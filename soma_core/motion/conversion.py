@@ -194,9 +194,7 @@ def people_names(source: Path) -> dict[str, str]:
             f"{source}: person", got="all, of a file without people to choose from",
             expected="one of the SMPL family, of GEM-X or kimodo", fix="Leave person out.",
         )  # fmt: skip
-    names = {
-        person: fitting(re.sub(r"[^\w.-]+", "_", person).strip(".") or "person") for person in people
-    }
+    names = {person: fitting(re.sub(r"[^\w.-]+", "_", person).strip(".") or "person") for person in people}
     taken = dict.fromkeys(names.values())
     return (
         names
