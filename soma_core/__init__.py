@@ -19,12 +19,11 @@ if TYPE_CHECKING:
     from soma_core.inversion.autograd import AutogradOptions
     from soma_core.inversion.diagnosis import diagnose_fit
     from soma_core.inversion.fit import PoseInversion
-    from soma_core.inversion.point_fit import PointResult
     from soma_core.inversion.point_identity import fit_point_identity
     from soma_core.inversion.point_priors import JointPrior, JointRange
     from soma_core.inversion.points import PointInversion
     from soma_core.inversion.priors import HINGES, PosePriors
-    from soma_core.inversion.result import IdentityFit, InversionResult
+    from soma_core.inversion.result import IdentityFit, InversionResult, PointResult
     from soma_core.io.amass import SmplMotion, write_amass
     from soma_core.io.camera import Camera, read_camera, read_cameras
     from soma_core.io.clip import SkinnedClip, skinned_clip
@@ -128,14 +127,13 @@ _HOMES = {
     "soma_core.paths": ["assets_dir"],
     # The way back: from vertices to poses and bodies
     "soma_core.inversion.fit": ["PoseInversion"],
-    "soma_core.inversion.result": ["IdentityFit", "InversionResult"],
+    "soma_core.inversion.result": ["IdentityFit", "InversionResult", "PointResult"],
     "soma_core.native.identity": ["fit_identity"],
     "soma_core.inversion.priors": ["HINGES", "PosePriors"],
     "soma_core.inversion.diagnosis": ["diagnose_fit"],
     "soma_core.inversion.analytical": ["AnalyticalOptions"],
     "soma_core.inversion.autograd": ["AutogradOptions"],
     "soma_core.inversion.points": ["PointInversion"],
-    "soma_core.inversion.point_fit": ["PointResult"],
     "soma_core.inversion.point_identity": ["fit_point_identity"],
     "soma_core.inversion.point_priors": ["JointPrior", "JointRange"],
     # Named points: keypoints, markers, joints of other rigs

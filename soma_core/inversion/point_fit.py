@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import torch
@@ -12,15 +12,16 @@ from torch import Tensor
 
 from soma_core.geometry.rotations import axis_angle_to_matrix, matrix_to_axis_angle
 from soma_core.inversion._inputs import refuse_unit_error
+from soma_core.inversion.moments import RestMoments
 from soma_core.inversion.point_model import PointModel, PointRest
 from soma_core.inversion.point_rows import PointRows, rows_of
 from soma_core.inversion.point_start import PointStart
-from soma_core.inversion.problem import Pose, part_of
-from soma_core.inversion.result import InversionResult
+from soma_core.inversion.problem import Pose, bridged, part_of
+from soma_core.inversion.result import InversionResult, PointResult
 from soma_core.kernels._threads import in_parts, shared_out
 from soma_core.skeleton.identity import Identity
 
-__all__ = ["FEWEST", "SEVERAL", "PointFit", "PointResult", "bridged", "determined", "paces", "trusted"]
+__all__ = ["FEWEST", "SEVERAL", "PointFit", "determined", "paces", "trusted"]
 
 _CHUNK, SEVERAL = 2048, 256
 """Frames fitted at a time at most, and how many are worth a thread of their own."""
@@ -67,25 +68,6 @@ _SURE = 0.5
 """A joint is determined where its angle is surer than this share of what is expected of it anyway."""
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class PointResult(InversionResult):
-    """The pose of every frame, and how well it explains the points.
-
-    ``vertex_error`` is that of the points, (frames, P). ``determined`` says which joints the points tell more
-    of than what is expected of a person anyway; ``angle_std`` of the others is the spread that is expected.
-
-    Attributes:
-        noise: standard deviation of a coordinate of the points [m], as it was given or found.
-    """
-
-    noise: float
-
-    @property
-    def point_error(self) -> Tensor:
-        """Distance of each point to its target [m], (frames, P); NaN where it is not known."""
-        return self.vertex_error
-
-
 class _Chunk(NamedTuple):
     """Some frames of a fit."""
 
@@ -130,10 +112,14 @@ class PointFit:
         self.sure, self.valid = every, (every > 0).sum(1) >= FEWEST
         total = every.sum(1, keepdim=True).clamp_min(1e-12)
         self.origin = (every[..., None] * points).sum(1) / total
-        self.points = (points - self.origin[:, None]) * (every > 0)[..., None]
+        self.points = points - self.origin[:, None]
+        if not bool((weights > 0).all()):
+            self.points *= (every > 0)[..., None]
         self.noise = _FIRST_NOISE if noise is None else noise
+        self.targets: dict[int, Tensor] = {}  # of chunks, by their first frames
         self.mean: Tensor | None = None  # where joints of this motion rest, once it has told
         self.shift, self.bridged = torch.zeros_like(self.points), False
+        self.others: Tensor | None = None  # turns of the joints that points say nothing of; None at rest
         still = model.mean.expand(len(points), -1, 3, 3)
         self.pose = Pose.begin(still, torch.zeros_like(self.origin))
 
@@ -154,16 +140,17 @@ class PointFit:
 
     def begin(self, initial: InversionResult | None, *, named: str = "points") -> None:
         """Start from the points, or from an earlier result; `named` is what is in another unit, if so."""
-        begun = self._each(lambda one: self.start(one.rest, one.points, one.weights))
-        relative, hips, scale = (torch.cat(parts) for parts in zip(*begun, strict=True))
+        at_rest = self.start.expected(self.rest) if len(self.rest.local) == 1 else None
+        scale = self.start.sizes(self.rest, self.points - self.shift, self.weights, at_rest)
         scale = scale[torch.isfinite(scale)]
         if len(scale):
             refuse_unit_error(scale, named)
         if initial is not None:
-            still = torch.eye(3).to(self.points).expand(len(self.points), 1, 3, 3)
-            relative = torch.cat((still, initial.rotations.to(self.points)), 1)
-            hips = initial.translation.to(self.points) - self.origin
-        self.pose = Pose.begin(relative, hips)
+            self.others = initial.rotations.to(self.points)
+            self.pose = self.model.pose(self.others, initial.translation.to(self.points) - self.origin)
+            return
+        begun = self._each(lambda one: self.start(one.rest, one.points, one.weights, at_rest))
+        self.pose = Pose.begin(*(torch.cat(parts) for parts in zip(*begun, strict=True)))
 
     def run(self) -> None:
         """Fit, look at the noise, and at what twist joints and correctives do, and fit again."""
@@ -188,6 +175,9 @@ class PointFit:
             return
         targets = self.points - self.shift + self.origin[:, None]
         found = bridged(replace(pose, translation=pose.translation + self.origin), self.valid)
+        if self.others is not None:
+            others = Pose.begin(self.others, found.translation)
+            self.others = bridged(others, self.valid).relative
         for turn in range(_ROUNDS):
             found = self.lowered(targets + self.shift, fps)(found)
             self.pose = replace(found, translation=found.translation - self.origin)
@@ -230,6 +220,7 @@ class PointFit:
         some = torch.nonzero(self.valid).flatten()
         some = some[torch.linspace(0, len(some) - 1, min(len(some), _SAMPLED)).round().long()]
         twin = copy.copy(self)
+        twin.targets = {}
         for name in ("weights", "every", "sure", "valid", "origin", "points", "shift"):
             value = getattr(self, name)
             setattr(twin, name, value if len(value) == 1 < len(self.valid) else value[some])
@@ -238,6 +229,11 @@ class PointFit:
             twin._solve(_FIRST_NOISE, held=held)
         return twin
 
+    def _rotations(self, pose: Pose, frames: slice, out: Tensor | None = None) -> Tensor:
+        """All rotations (f, J - 1, 3, 3) of some frames."""
+        others = self.others
+        return self.model.rotations(pose, others if others is None else others[frames], out)
+
     def _solve(self, noise: float, *, held: bool = False) -> None:
         """Steps of all frames under a noise [m].
 
@@ -245,10 +241,14 @@ class PointFit:
         """
         still, model = _STILL * noise * (0.1 if held else 1.0), self.model
         done = {name: torch.empty_like(value) for name, value in vars(self.pose).items()}
+        moments_of = self._moments(noise, held=held)
 
         def solve(one: _Chunk) -> None:
-            moments = model.moments(one.rest, one.weights, noise**2, held=held)
-            target = model.target(one.rest, one.points, one.weights)
+            moments = moments_of(one)
+            target = self.targets.get(one.frames.start)
+            if target is None:
+                target = model.target(one.rest, one.points, one.weights)
+                self.targets[one.frames.start] = target
             if held:
                 target = model.held(target, model.walk(one.pose, one.rest)[0], noise**2)
             found = model.solver(target, moments, one.pose, iterations=self.iterations, tolerance=still)
@@ -258,13 +258,22 @@ class PointFit:
         self._each(solve)
         self.pose = Pose(**done)
 
+    def _moments(self, noise: float, *, held: bool = False) -> Callable[[_Chunk], RestMoments]:
+        """Moments of a chunk under a noise [m]; they are the same for all of one body and one weight."""
+        if len(self.rest.local) == 1 == len(self.weights):
+            same = self.model.moments(self.rest, self.weights, noise**2, held=held)
+            return lambda _: same
+        return lambda one: self.model.moments(one.rest, one.weights, noise**2, held=held)
+
     def _trusted(self) -> bool:
         """Let points count less that miss by more than noise does; whether that changed anything."""
-        misses = self._distances()
-        weights = self.sure * trusted(misses * self.sure.sqrt(), max(self.noise, _FIRST_NOISE))
+        noise, misses = max(self.noise, _FIRST_NOISE), self._distances() * self.sure.sqrt()
+        if self.every is self.sure and bool((misses < _OUTLYING * noise).all()):
+            return False
+        weights = self.sure * trusted(misses, noise)
         same = torch.allclose(weights, self.every, atol=_SETTLED)
         if not same:
-            self.weights, self.every = weights, weights
+            self.weights, self.every, self.targets = weights, weights, {}
             if self.given is None:
                 self.noise = min(self.noise, self._typical())
         return not same
@@ -318,36 +327,42 @@ class PointFit:
             plain = self._misses(one) + one.points
             scale = self.bone_scale
             posed = layer.pose(
-                part_of(self.identity, one.frames), one.pose.relative[:, 1:], one.pose.translation,
+                part_of(self.identity, one.frames), self._rotations(one.pose, one.frames),
+                one.pose.translation,
                 bone_scale=scale if scale is None or len(scale) == 1 else scale[one.frames],
             )  # fmt: skip
             self.shift[one.frames] = places(posed.transforms, posed.vertices[:, places.vertex_ids]) - plain
 
         self._each(correct)
+        self.targets = {}
 
-    def _angle_std(self) -> Tensor:
-        """Standard deviation (F, J - 1) [degrees] of each joint's own turn."""
-        model = self.model
-        every, noise = model.spread.repeat(len(self.points), 1), max(self.noise, _LEAST_CLAIM)
+    def _told(self) -> tuple[Tensor, Tensor, Tensor]:
+        """What points miss (F, P) [m]; standard deviations [degrees] and rotations of the rig's joints."""
+        model, count = self.model, len(self.points)
+        noise = max(self.noise, _LEAST_CLAIM)
+        moments_of, error = self._moments(noise), self.points.new_empty(self.points.shape[:2])
+        std = model.spread[1:].repeat(count, 1)
+        rotations = std.new_empty(count, *model.still.shape)
 
-        def put(one: _Chunk) -> None:
-            variance = model.variances(model.moments(one.rest, one.weights, noise**2), one.pose)
-            every[one.frames, model.solver.variables] = (noise * variance.clamp_min(0).sqrt()).rad2deg()
+        def tell(one: _Chunk) -> None:
+            error[one.frames] = self._misses(one).square().sum(-1).sqrt()
+            variance = model.variances(moments_of(one), one.pose)
+            std[one.frames, model.kept[1:] - 1] = (noise * variance.clamp_min(0).sqrt()).rad2deg()
+            self._rotations(one.pose, one.frames, rotations[one.frames])
 
-        self._each(put)
-        return every[:, 1:]
+        self._each(tell)
+        return error, std, rotations
 
     def result(self, known: Tensor) -> PointResult:
         """What the pose is worth; `known` (F, P) tells which points are."""
         valid = self.valid
-        error = self._distances()
+        error, std, rotations = self._told()
         mass = self.every.sum(1).clamp_min(1e-12)
         residual = ((self.every * error.square()).sum(1) / mass).sqrt()
-        eye = torch.eye(3, dtype=error.dtype, device=error.device)
-        std = self._angle_std()
         posed = valid | self.bridged
+        rotations[~posed] = torch.eye(3).to(error)
         return PointResult(
-            rotations=torch.where(posed[:, None, None, None], self.pose.relative, eye)[:, 1:],
+            rotations=rotations,
             translation=torch.where(posed[:, None], self.pose.translation + self.origin, 0.0),
             vertex_error=error.masked_fill(~(known & valid[:, None]), torch.nan),
             valid=valid,
@@ -379,18 +394,3 @@ def trusted(misses: Tensor, noise: float) -> Tensor:
 def determined(std: Tensor, model: PointModel) -> Tensor:
     """Whether angles (F, J - 1) [degrees] are told by the points, rather than by what is expected."""
     return std < _SURE * model.spread[1:]
-
-
-def bridged(pose: Pose, known: Tensor) -> Pose:
-    """A pose in the world; frames that are not `known` (F,) between those before and after them."""
-    good = torch.nonzero(known).flatten()
-    if len(good) in (0, len(known)):
-        return pose
-    at = torch.arange(len(known), device=good.device)
-    after = torch.searchsorted(good, at).clamp(max=len(good) - 1)
-    first, last = good[(after - (good[after] > at).long()).clamp_min(0)], good[after]
-    share = ((at - first) / (last - first).clamp_min(1)).clamp(0, 1).to(pose.translation)
-    turn = matrix_to_axis_angle(pose.relative[last] @ pose.relative[first].mT)
-    relative = axis_angle_to_matrix(share[:, None, None] * turn) @ pose.relative[first]
-    hips = torch.lerp(pose.translation[first], pose.translation[last], share[:, None])
-    return replace(pose, relative=relative, translation=hips)

@@ -39,14 +39,14 @@ def attach_point_gradient(
     def pulled(
         rotations: Tensor, translation: Tensor, by_rotations: Tensor, by_translation: Tensor
     ) -> tuple[Tensor, Tensor]:
-        eye = torch.eye(3).to(rotations).expand(len(rotations), 1, 3, 3)
-        pose = Pose.begin(torch.cat((eye, rotations), 1), translation)
         with torch.enable_grad():
             leaf = still.clone().requires_grad_()
             solve = rows(leaf)
+            pose = solve.model.pose(rotations, translation)
             step = torch.zeros(len(rotations), solve.size).to(rotations).requires_grad_()
             moved = solve.moved(pose, step)
-            told = (moved.relative[:, 1:] * by_rotations).sum() + (moved.translation * by_translation).sum()
+            by_kept = by_rotations[:, solve.model.kept[1:] - 1]
+            told = (moved.relative[:, 1:] * by_kept).sum() + (moved.translation * by_translation).sum()
             (wanted,) = torch.autograd.grad(told, step)
             (slope,) = torch.autograd.grad(solve.energy_near(pose, step), step, create_graph=True)
         with torch.no_grad():

@@ -164,7 +164,8 @@ class _Search:
         identity = self.parameters.identities(point[None])
         result = self.inversion(self.points, identity, weights=self.given, noise=noise)
         state = _State(
-            point=point, identity=identity, pose=result.pose(), energy=0.0, noise=result.noise,
+            point=point, identity=identity, energy=0.0, noise=result.noise,
+            pose=self.inversion.model.pose(result.rotations, result.translation),
             error=float(result.residual.square().nanmean().sqrt()),
         )  # fmt: skip
         return replace(state, energy=self._energy(state, result.noise))
@@ -185,7 +186,7 @@ class _Search:
         model = self.inversion.model
         if not model.corrected:
             return 0.0
-        posed = model.layer.pose(state.identity, state.pose.relative[:, 1:], state.pose.translation)
+        posed = model.layer.pose(state.identity, model.rotations(state.pose), state.pose.translation)
         points = model.places(posed.transforms, posed.vertices[:, model.places.vertex_ids])
         return points - _seen(model, state.identity, state.pose)
 

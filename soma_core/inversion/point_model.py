@@ -20,7 +20,7 @@ from soma_core.inversion.gauss_newton import HINGE_STIFFNESS, GaussNewton, dampe
 from soma_core.inversion.moments import RestMoments
 from soma_core.inversion.point_priors import JointPrior
 from soma_core.inversion.problem import Pose
-from soma_core.inversion.structure import skin_structure
+from soma_core.inversion.structure import MomentStructure, skin_structure
 from soma_core.layer import SomaLayer
 from soma_core.points.places import PointPlaces
 from soma_core.skeleton.identity import Identity
@@ -40,7 +40,7 @@ class PointRest:
 
     Attributes:
         local: ``b`` of every point at every weighted joint, (i, P, T, 4) [m].
-        offsets: bone vectors in T-pose world axes, (i, J, 3) [m].
+        offsets: bone vectors of the kept joints in T-pose world axes, (i, K, 3) [m].
     """
 
     local: Tensor
@@ -50,6 +50,9 @@ class PointRest:
 class PointModel(torch.nn.Module):
     """Points on plain skinning of one rig, and the solver of its poses.
 
+    A fit knows K joints, the root and those that points say anything about; their numbers here are among
+    these. All others stay at rest.
+
     Args:
         layer: the forward model.
         places: the points.
@@ -58,19 +61,23 @@ class PointModel(torch.nn.Module):
 
     Attributes:
         solver: steps on moments.
+        kept: (K,) numbers of the joints in the rig, ascending.
         joints: (T,) joints that carry points, or that a prior ties to these.
-        variables: (n,) joints that points say anything about.
-        mean: (J, 3, 3) where a pose is expected.
-        spread: (J,) root mean square angle [degrees] that each joint is expected to be off by.
-        pull: (J, 3, 3) how strongly it is, as ``JointPrior.of`` says [1/rad^2].
-        hinged: (J,) whether a joint is a hinge.
-        tells, follows: (J,) whose rest is a person's posture, as ``JointRange`` says.
-        pace: (J,) usual angular accelerations [rad/s^2].
+        variables: (n,) joints that points say anything about: all but the root.
+        still: (J - 1, 3, 3) where the rig's joints are expected.
+        spread: (J,) root mean square angle [degrees] that each joint of the rig is expected to be off by.
+        mean: (K, 3, 3) where a pose is expected.
+        pull: (K, 3, 3) how strongly it is, as ``JointPrior.of`` says [1/rad^2].
+        hinged: (K,) whether a joint is a hinge.
+        tells, follows: (K,) whose rest is a person's posture, as ``JointRange`` says.
+        pace: (K,) usual angular accelerations [rad/s^2].
         prior: (p, 4, 4) moments of the prior, of the solver's pairs [1/rad^2].
     """
 
     prior: Tensor
     hold: Tensor
+    kept: Tensor
+    still: Tensor
     mean: Tensor
     pull: Tensor
     hinged: Tensor
@@ -91,28 +98,31 @@ class PointModel(torch.nn.Module):
         ties = np.zeros((len(tied), rig.joint_count))
         ties[np.arange(len(tied)), tied] = ties[np.arange(len(tied)), parents[tied]] = 1
         rows = scipy.sparse.csr_array(np.concatenate([carried.astype(float), ties]))
-        structure = skin_structure(replace(rig, weights=rows, procedural=None), np.ones(rows.shape[0], bool))
-        self.structure = structure
+        whole = skin_structure(replace(rig, weights=rows, procedural=None), np.ones(rows.shape[0], bool))
+        self.structure = structure = _alone(whole)
         self.solver = GaussNewton(structure, warp=warp, apart=True, **kind)
         self.joints, self.variables = structure.joints, structure.variables
-        self.prior_mean, blocks = prior.of(rig.joint_names)
-        row = {int(joint): place for place, joint in enumerate(structure.joints)}
+        mean, blocks = prior.of(rig.joint_names)
+        row = {int(joint): place for place, joint in enumerate(whole.joints)}
         pair = {tuple(one): place for place, one in enumerate(structure.pairs.tolist())}
         moments = np.zeros((len(structure.pairs), 4, 4))
         for joint in tied:
             own, above = row[int(joint)], row[int(parents[joint])]
-            moved = np.einsum("ab,bc->ac", self.prior_mean[joint], blocks[joint])
+            moved = np.einsum("ab,bc->ac", mean[joint], blocks[joint])
             moments[pair[own, own], :3, :3] += blocks[joint]
-            moments[pair[above, above], :3, :3] += moved @ self.prior_mean[joint].T
+            moments[pair[above, above], :3, :3] += moved @ mean[joint].T
             assert above < own, "parents come before their children"
             moments[pair[above, own], :3, :3] -= moved
-        keep = {
-            "prior": moments, "mean": self.prior_mean,
-            "parents": np.maximum(parents, 0), "weighted": structure.joints,
-            "spread": _spread(blocks), "pull": blocks, "pace": prior.paces(rig.joint_names),
-            "hold": _HELD * _hold(structure.pairs),
+        kept = np.concatenate(([0], variables))
+        hinged = np.isin(np.arange(rig.joint_count), list(prior.hinges(rig.joint_names)))
+        each = {
+            "mean": mean, "pull": blocks, "pace": prior.paces(rig.joint_names), "hinged": hinged,
             **prior.postures(rig.joint_names),
-            "hinged": np.isin(np.arange(rig.joint_count), list(prior.hinges(rig.joint_names))),
+        }  # fmt: skip
+        keep = {
+            "prior": moments, "hold": _HELD * _hold(structure.pairs), "spread": _spread(blocks),
+            "kept": kept, "still": mean[1:], "weighted": structure.joints,
+            "parents": np.maximum(structure.parents, 0), **{key: of[kept] for key, of in each.items()},
         }  # fmt: skip
         for key, array in keep.items():
             tensor = torch.as_tensor(np.ascontiguousarray(array), device=layer.device)
@@ -122,6 +132,11 @@ class PointModel(torch.nn.Module):
         self.first, self.second = (
             torch.as_tensor(side.copy(), device=layer.device) for side in structure.pairs.T
         )
+        starts = [place for place in range(1, len(kept)) if place == 1 or kept[place] != kept[place - 1] + 1]
+        ends = [*starts[1:], len(kept)]
+        self.runs = [
+            (int(kept[a]) - 1, int(kept[a]) - 1 + b - a, a) for a, b in zip(starts, ends, strict=True)
+        ]
         self._build_atoms(row, parents, **kind)
 
     def _influences(self, places: PointPlaces, rig) -> np.ndarray:
@@ -178,12 +193,12 @@ class PointModel(torch.nn.Module):
             add(at, torch.nn.functional.pad(away, (0, 1)))
         if len(self.skin_at):
             at = self.skin_at
-            joint = self.weighted[at[:, 1]]
+            joint = self.kept[self.weighted[at[:, 1]]]
             turn = self.orient[joint] @ bind[:, joint, :3, :3].mT
             step = identity.rest[:, places.vertex_ids[at[:, 2]]] - bind[:, joint, :3, 3]
             point = (turn @ step[..., None]).squeeze(-1)
             add(at, self.skin_weight[:, None] * torch.nn.functional.pad(point, (0, 1), value=1.0))
-        return PointRest(local=local, offsets=offsets)
+        return PointRest(local=local, offsets=offsets[:, self.kept])
 
     def moments(self, rest: PointRest, weights: Tensor, prior: float, *, held: bool = False) -> RestMoments:
         """``N`` of points with weights (1 or F, P), and of the prior times `prior` [m^2].
@@ -199,8 +214,22 @@ class PointModel(torch.nn.Module):
         empty = pairs.new_empty(len(pairs), 0)
         return RestMoments(local=empty, weight=empty, own=own, second=pairs, offsets=rest.offsets)
 
+    def pose(self, rotations: Tensor, translation: Tensor) -> Pose:
+        """A pose of the kept joints, from all of the rig's rotations (F, J - 1, 3, 3)."""
+        root = torch.eye(3).to(rotations).expand(len(rotations), 1, 3, 3)
+        return Pose.begin(torch.cat((root, rotations[:, self.kept[1:] - 1]), 1), translation)
+
+    def rotations(self, pose: Pose, others: Tensor | None = None, out: Tensor | None = None) -> Tensor:
+        """All of the rig's rotations (F, J - 1, 3, 3); joints not kept have those of `others`, or rest."""
+        others = self.still.expand(len(pose.relative), -1, -1, -1) if others is None else others
+        every = torch.empty(others.shape, dtype=others.dtype, device=others.device) if out is None else out
+        every.copy_(others)
+        for first, stop, place in self.runs:
+            every[:, first:stop] = pose.relative[:, place : place + stop - first]
+        return every
+
     def held(self, target: Tensor, turns: Tensor, prior: float) -> Tensor:
-        """``R`` (F, T, 3, 4) that also pulls to world turns (F, J, 3, 3)."""
+        """``R`` (F, T, 3, 4) that also pulls to world turns (F, K, 3, 3)."""
         return target + _HELD * prior * torch.nn.functional.pad(turns[:, self.weighted], (0, 1))
 
     def target(self, rest: PointRest, points: Tensor, weights: Tensor) -> Tensor:
@@ -236,7 +265,7 @@ class PointModel(torch.nn.Module):
         return own.unflatten(1, (-1, 3)).sum(-1)[:, :-1]
 
     def walk(self, pose: Pose, rest: PointRest) -> tuple[Tensor, Tensor]:
-        """Turns (F, J, 3, 3) and places (F, J, 3) [m] of all joints."""
+        """Turns (F, K, 3, 3) and places (F, K, 3) [m] of all joints."""
         kernels = self.solver.kernels
         if kernels is None:
             return self.solver.walk_public(pose, rest.offsets)
@@ -244,12 +273,27 @@ class PointModel(torch.nn.Module):
         return kernels.walked(kernels.constants(none, rest.offsets), pose.relative, pose.translation)
 
     def points(self, rest: PointRest, turns: Tensor, places: Tensor) -> Tensor:
-        """Points (F, P, 3) [m] at turns (F, J, 3, 3) and places (F, J, 3) of all joints."""
-        moved = torch.cat((turns[:, self.weighted], places[:, self.weighted, :, None]), -1)
-        flat = moved.transpose(1, 2).flatten(2)  # (F, 3, 4 T)
+        """Points (F, P, 3) [m] at turns (F, K, 3, 3) and places (F, K, 3) of all joints."""
+        if len(self.joints) == len(self.variables):  # all but the root
+            turns, places = turns[:, 1:], places[:, 1:]
+        else:
+            turns, places = turns[:, self.weighted], places[:, self.weighted]
+        flat = torch.cat((turns.transpose(1, 2), places.mT[..., None]), -1).flatten(2)  # (F, 3, 4 T)
         local = rest.local.flatten(2).transpose(1, 2)  # (i, 4 T, P)
         product = flat.flatten(0, 1) @ local[0] if len(local) == 1 else flat @ local
-        return product.view(len(flat), 3, -1).transpose(1, 2)
+        return product.view(len(flat), 3, len(self.places.names)).transpose(1, 2)
+
+
+def _alone(structure: MomentStructure) -> MomentStructure:
+    """The structure of a rig that has the root and the variables alone."""
+    kept = np.concatenate(([0], structure.variables))
+    place = np.full(len(structure.parents), -1)
+    place[kept] = np.arange(len(kept))
+    above = structure.parents[kept]
+    return replace(
+        structure, parents=np.where(above < 0, -1, place[above]), joints=place[structure.joints],
+        variables=place[structure.variables],
+    )  # fmt: skip
 
 
 def _skin(places: PointPlaces, rig) -> tuple[np.ndarray, np.ndarray]:

@@ -224,9 +224,9 @@ class PointRows:
             crossed[..., 1, 0] - crossed[..., 0, 1],
         ], -1)  # fmt: skip
         slope[:, :-3] += torque.flatten(1)
-        for place in range(len(self.variables)):
-            at = slice(3 * place, 3 * place + 3)
-            matrix[:, at, at] += block[:, place]
+        n = len(self.variables)
+        own = matrix[:, :-3, :-3].unflatten(2, (n, 3)).unflatten(1, (n, 3)).diagonal(dim1=1, dim2=3)
+        own += block.permute(0, 2, 3, 1)  # (F, 3, 3, n)
         return energy
 
     def _velocity(self, pose: Pose) -> Tensor:

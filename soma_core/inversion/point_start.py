@@ -40,21 +40,11 @@ class PointStart(torch.nn.Module):
     def __init__(self, model: PointModel, hinges: dict[int, np.ndarray], *, warp: bool) -> None:
         super().__init__()
         self.model, self.warp = model, warp
-        parents = model.structure.parents
-        rest = model.rest(model.layer.identity())
-        local = rest.local[0].double().cpu().numpy()  # (P, T, 4)
-        owner = model.joints[np.abs(local[..., 3]).argmax(1)]
-        centre = np.full(len(parents), -1)
-        bones = rest.offsets[0].double().cpu().numpy()
-        for joint in range(1, len(parents)):
-            above = max(int(parents[joint]), 1)
-            own = np.flatnonzero(owner == above)
-            place = bones[joint] * (joint > 1)
-            rows = local[own, np.searchsorted(model.joints, above)][:, :3] if len(own) else np.zeros((0, 3))
-            away = np.linalg.norm(rows - place, axis=1)
-            if len(own) and away.min() < 1e-4:  # exactly the centre: what else a body has, is not
-                centre[joint] = own[away.argmin()]
-        self.centre = centre
+        self.centres = _centres(model)
+        kept, parents = model.kept.tolist(), model.structure.parents
+        self.centre = centre = self.centres[kept]
+        axes = {place: hinges[joint] for place, joint in enumerate(kept) if joint in hinges}
+        self.owner = owner = _owner(model)
         above = model.structure.ancestors
         self.steps: list[tuple[int, int, np.ndarray, tuple[int, np.ndarray] | None]] = []
         for joint in model.variables:
@@ -68,10 +58,14 @@ class PointStart(torch.nn.Module):
                 weight[point] = _FARTHER**seen
             if joint > 1 and centre[joint] >= 0:
                 weight[centre[joint]] = 0
-            hinge = next(((j, hinges[j]) for j in hinges if parents[j] == joint and centre[j] >= 0), None)
+            hinge = next(((j, axes[j]) for j in axes if parents[j] == joint and centre[j] >= 0), None)
             self.steps.append((int(joint), int(parents[joint]), weight, hinge))
-        self.owner = owner
-        self.register_buffer("plan", self._planned(len(owner)).to(model.mean.device), persistent=False)
+        axes = np.array([np.zeros(3) if hinge is None else hinge[1] for *_, hinge in self.steps])
+        keep = {"plan": self._planned(len(owner)), "axes": torch.tensor(axes).to(model.mean)}
+        keep["at"] = torch.tensor([entry[:2] for entry in self.entries])
+        keep["share"] = torch.tensor([entry[2] for entry in self.entries]).to(model.mean)
+        for name, value in keep.items():
+            self.register_buffer(name, value.to(model.mean.device), persistent=False)
 
     def _planned(self, count: int) -> Tensor:
         """Lists of the kernel, int32, as ``kernels.point_start_wp`` reads them."""
@@ -95,43 +89,49 @@ class PointStart(torch.nn.Module):
     def _by_warp(
         self, rest: PointRest, points: Tensor, weights: Tensor, at_rest: Tensor
     ) -> tuple[Tensor, Tensor]:
-        """Rotations (F, J, 3, 3) and Hips positions (F, 3) of one identity."""
+        """Rotations (F, K, 3, 3) and Hips positions (F, 3) of one identity."""
         from soma_core.kernels.point_start_wp import begun
 
         model, joints = self.model, self.model.solver.variables
-        axes = points.new_tensor(
-            np.array([np.zeros(3) if hinge is None else hinge[1] for *_, hinge in self.steps])
-        )
-        own = torch.cat((model.mean[joints].flatten(1), rest.offsets[0, joints], axes), 1)
-        at = torch.tensor([entry[:2] for entry in self.entries], device=points.device)
-        share = points.new_tensor([entry[2] for entry in self.entries])
-        arms = torch.cat((share[:, None], at_rest[0, at[:, 0], at[:, 1]]), 1)
+        at = self.at
+        own = torch.cat((model.mean[joints].flatten(1), rest.offsets[0, joints], self.axes), 1)
+        arms = torch.cat((self.share[:, None], at_rest[0, at[:, 0], at[:, 1]]), 1)
         numbers = torch.cat(
             (points.new_tensor([_EXPECTED, _BEND, _SLIGHT, 0.0]), own.flatten(), arms.flatten())
         )
         relative = model.mean.repeat(len(points), 1, 1, 1)
         return relative, begun(self.plan, numbers, points, weights, relative)
 
-    def forward(self, rest: PointRest, points: Tensor, weights: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Rotations (F, J, 3, 3), Hips positions (F, 3) [m], sizes (f,) of some frames.
+    def forward(
+        self, rest: PointRest, points: Tensor, weights: Tensor, at_rest: Tensor | None = None
+    ) -> tuple[Tensor, Tensor]:
+        """Rotations (F, K, 3, 3) and Hips positions (F, 3) [m] of some frames.
 
         Args:
             rest: of one identity, or of one a frame.
             points: targets (F, P, 3) [m], finite.
             weights: (1 or F, P), 0 for points that are not known.
+            at_rest: of :meth:`expected`, where it is known.
         """
-        at_rest = self._expected(rest)
-        weights = weights.expand(len(points), -1)
+        at_rest = self.expected(rest) if at_rest is None else at_rest
         few = self.warp and len(rest.local) == 1 == len(rest.offsets)
         turned = self._by_warp if few else self._by_torch
+        return turned(rest, points, weights.expand(len(points), -1), at_rest)
+
+    def sizes(
+        self, rest: PointRest, points: Tensor, weights: Tensor, at_rest: Tensor | None = None
+    ) -> Tensor:
+        """Sizes (f,) beside the bodies, of some of the frames; arguments are those of :meth:`forward`."""
         some = slice(None, None, max(1, len(points) // _MEASURED))
-        scale = self._scale(points[some], weights[some], at_rest if len(at_rest) == 1 else at_rest[some])
-        return *turned(rest, points, weights, at_rest), scale
+        if len(rest.local) > 1:
+            rest = PointRest(local=rest.local[some], offsets=rest.offsets[some])
+        at_rest = self.expected(rest) if at_rest is None else at_rest
+        return self._scale(points[some], weights.expand(len(points), -1)[some], at_rest)
 
     def _by_torch(
         self, rest: PointRest, points: Tensor, weights: Tensor, at_rest: Tensor
     ) -> tuple[Tensor, Tensor]:
-        """Rotations (F, J, 3, 3) and Hips positions (F, 3)."""
+        """Rotations (F, K, 3, 3) and Hips positions (F, 3)."""
         model, count = self.model, len(points)
         mean = model.mean
         turns = torch.eye(3, dtype=points.dtype, device=points.device).repeat(
@@ -173,19 +173,18 @@ class PointStart(torch.nn.Module):
 
         Bones between a joint that is seen and the nearest points below it; the whole cloud without such.
         """
-        ratios = []
-        for joint, _, own, _ in self.steps:
-            centre = self.centre[joint]
-            if centre < 0:
-                continue
-            weight = weights * points.new_tensor(own == 1) * (weights[:, centre, None] > 0)
-            away = (points - points[:, centre, None]).norm(dim=-1)
-            total = (weight * at_rest[:, joint].norm(dim=-1)).sum(1)
-            ratio = (weight * away).sum(1) / total
-            ratios.append(torch.where(total > 0, ratio, torch.nan))
-        if not ratios:
+        known = np.flatnonzero([self.centre[joint] >= 0 for joint, *_ in self.steps])
+        if not len(known):
             return points.new_ones(len(points))
-        return torch.stack(ratios, 1).nanmedian(1).values
+        joints, near = zip(
+            *((joint, own == 1) for joint, _, own, _ in (self.steps[k] for k in known)), strict=True
+        )
+        centre = self.centre[list(joints)]
+        weight = weights[:, None] * points.new_tensor(np.stack(near)) * (weights[:, centre, None] > 0)
+        away = (points[:, None] - points[:, centre, None]).square().sum(-1).sqrt()  # (f, joints, P)
+        total = (weight * at_rest[:, list(joints)].norm(dim=-1)).sum(2)
+        ratio = (weight * away).sum(2) / total
+        return torch.where(total > 0, ratio, torch.nan).nanmedian(1).values
 
     def _turn(self, weight: Tensor, aims: Tensor, arms: Tensor, expected: Tensor, bend) -> Tensor:
         """Turn (F, 3, 3) of arms (i, P, 3) towards aims (F, P, 3)."""
@@ -221,8 +220,8 @@ class PointStart(torch.nn.Module):
         seen = seen & ~(wrong & (normal.norm(dim=-1) < _SLIGHT))
         return normal * seen[:, None], points.new_tensor(axis)
 
-    def _expected(self, rest: PointRest) -> Tensor:
-        """Points (i, J, P, 3) about each joint in its own axes, where all joints are as expected."""
+    def expected(self, rest: PointRest) -> Tensor:
+        """Points (i, K, P, 3) about each joint in its own axes, where all joints are as expected."""
         model = self.model
         count = len(rest.local)
         relative = model.mean.expand(count, -1, 3, 3)
@@ -238,3 +237,27 @@ class PointStart(torch.nn.Module):
         from soma_core.kernels.nearest_rotation_wp import nearest_rotation
 
         return nearest_rotation(covariance)
+
+
+def _owner(model: PointModel) -> np.ndarray:
+    """(P,) the joint that carries most of each point."""
+    local = model.rest(model.layer.identity()).local[0].double().cpu().numpy()
+    return model.joints[np.abs(local[..., 3]).argmax(1)]
+
+
+def _centres(model: PointModel) -> np.ndarray:
+    """(J,) the point that is the centre of each joint of the rig; -1 where none is."""
+    body, parents, kept = model.layer.identity(), model.layer.rig.parents, model.kept.cpu().numpy()
+    local = model.rest(body).local[0].double().cpu().numpy()  # (P, T, 4)
+    bones = model.layer.animation.bone_vectors(body)[0].double().cpu().numpy()
+    owner, joints = kept[_owner(model)], kept[model.joints]
+    centre = np.full(len(parents), -1)
+    for joint in range(1, len(parents)):
+        above = max(int(parents[joint]), 1)
+        own = np.flatnonzero(owner == above)
+        place = bones[joint] * (joint > 1)
+        rows = local[own, np.searchsorted(joints, above)][:, :3] if len(own) else np.zeros((0, 3))
+        away = np.linalg.norm(rows - place, axis=1)
+        if len(own) and away.min() < 1e-4:  # exactly the centre: what else a body has, is not
+            centre[joint] = own[away.argmin()]
+    return centre

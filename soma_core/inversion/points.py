@@ -14,14 +14,14 @@ from soma_core._derived import Derived, own_precision
 from soma_core._inputs import check_bone_scale, check_choice
 from soma_core.errors import InputError
 from soma_core.inversion._inputs import check_weights, refuse_transforms
-from soma_core.inversion.point_fit import SEVERAL, PointFit, PointResult
+from soma_core.inversion.point_fit import SEVERAL, PointFit
 from soma_core.inversion.point_gradient import attach_point_gradient
 from soma_core.inversion.point_model import PointModel
 from soma_core.inversion.point_priors import JointPrior
 from soma_core.inversion.point_rows import PointRows
 from soma_core.inversion.point_start import PointStart
 from soma_core.inversion.point_views import Views
-from soma_core.inversion.result import InversionResult
+from soma_core.inversion.result import InversionResult, PointResult
 from soma_core.inversion.view_fit import ViewFit
 from soma_core.io.camera import Camera
 from soma_core.kernels._threads import side_by_side
@@ -162,11 +162,10 @@ class PointInversion(Derived):
         layer, count = self.layer, len(points)
         weights = check_weights(weights, points.new_ones(points.shape[1]), count)
         bone_scale = check_bone_scale(bone_scale, count, len(layer.joint_names), layer.dtype, layer.device)
-        known = torch.isfinite(points).all(-1)
-        if not bool(known.all()):
-            weights = weights * known
-        clean = torch.where(known[..., None], points, 0.0)
         with side_by_side(count, SEVERAL, points) as threads:
+            known, clean = torch.isfinite(points).all(-1), points
+            if not bool(known.all()):
+                weights, clean = weights * known, torch.where(known[..., None], points, 0.0)
             fit = PointFit(
                 self.model, self.start, clean, weights, identity, bone_scale, noise=noise,
                 iterations=self.iterations, threads=threads,
@@ -240,7 +239,7 @@ class PointInversion(Derived):
             points, _ = self.triangulated(points, cameras)
         points = self._checked(points)
         length = layer.animation.bone_vectors(identity).norm(dim=-1)[0]
-        centre, parents = self.start.centre, layer.rig.parents
+        centre, parents = self.start.centres, layer.rig.parents
         seen: dict[str, list[float]] = {}
         totals = [0.0, 0.0]
         for joint, name in enumerate(layer.rig.joint_names):
@@ -268,7 +267,7 @@ class PointInversion(Derived):
         known = torch.isfinite(points).all(-1)
         rest = self.model.rest(identity)
         return float(
-            self.start(rest, points.nan_to_num(0.0), known.to(points))[2].nanmedian().nan_to_num(1.0)
+            self.start.sizes(rest, points.nan_to_num(0.0), known.to(points)).nanmedian().nan_to_num(1.0)
         )
 
     def _floating(self, points: object) -> Tensor:

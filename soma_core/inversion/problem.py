@@ -8,11 +8,12 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from soma_core.geometry.rotations import axis_angle_to_matrix, matrix_to_axis_angle
 from soma_core.inversion.moments import RestMoments
 from soma_core.inversion.priors import JointTerms, TwistDoubt
 from soma_core.skeleton.identity import Identity
 
-__all__ = ["Activity", "Pose", "Problem", "View", "part_of"]
+__all__ = ["Activity", "Pose", "Problem", "View", "bridged", "part_of"]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -147,6 +148,21 @@ class View:
     turns: Tensor
     places: Tensor
     activity: Activity | None
+
+
+def bridged(pose: Pose, known: Tensor) -> Pose:
+    """A pose in the world; frames that are not `known` (F,) between those before and after them."""
+    good = torch.nonzero(known).flatten()
+    if len(good) in (0, len(known)):
+        return pose
+    at = torch.arange(len(known), device=good.device)
+    after = torch.searchsorted(good, at).clamp(max=len(good) - 1)
+    first, last = good[(after - (good[after] > at).long()).clamp_min(0)], good[after]
+    share = ((at - first) / (last - first).clamp_min(1)).clamp(0, 1).to(pose.translation)
+    turn = matrix_to_axis_angle(pose.relative[last] @ pose.relative[first].mT)
+    relative = axis_angle_to_matrix(share[:, None, None] * turn) @ pose.relative[first]
+    hips = torch.lerp(pose.translation[first], pose.translation[last], share[:, None])
+    return replace(pose, relative=relative, translation=hips)
 
 
 def part_of(identity: Identity, chunk: slice | Tensor) -> Identity:

@@ -12,7 +12,7 @@ from soma_core.inversion.problem import Pose
 from soma_core.layer import SomaLayer
 from soma_core.skeleton.identity import Identity
 
-__all__ = ["IdentityFit", "InversionResult", "joined"]
+__all__ = ["IdentityFit", "InversionResult", "PointResult", "joined"]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -101,6 +101,25 @@ class InversionResult:
     def part(self, chunk: slice | Tensor) -> InversionResult:
         """The result of some frames."""
         return InversionResult(**{one.name: getattr(self, one.name)[chunk] for one in fields(self)})
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class PointResult(InversionResult):
+    """The pose of every frame, and how well it explains the points.
+
+    ``vertex_error`` is that of the points, (frames, P). ``determined`` says which joints the points tell more
+    of than what is expected of a person anyway; ``angle_std`` of the others is the spread that is expected.
+
+    Attributes:
+        noise: standard deviation of a coordinate of the points [m], as it was given or found.
+    """
+
+    noise: float
+
+    @property
+    def point_error(self) -> Tensor:
+        """Distance of each point to its target [m], (frames, P); NaN where it is not known."""
+        return self.vertex_error
 
 
 def joined(parts: Sequence[InversionResult]) -> InversionResult:

@@ -12,8 +12,6 @@ from soma_core.geometry.rotations import axis_angle_to_matrix
 from soma_core.inversion.point_fit import (
     FEWEST,
     PointFit,
-    PointResult,
-    bridged,
     determined,
     paces,
     trusted,
@@ -22,8 +20,8 @@ from soma_core.inversion.point_model import PointModel, PointRest
 from soma_core.inversion.point_rows import PointRows
 from soma_core.inversion.point_start import PointStart
 from soma_core.inversion.point_views import Views
-from soma_core.inversion.problem import Pose, part_of
-from soma_core.inversion.result import InversionResult
+from soma_core.inversion.problem import Pose, bridged, part_of
+from soma_core.inversion.result import InversionResult, PointResult
 from soma_core.skeleton.identity import Identity
 
 __all__ = ["ViewFit"]
@@ -75,6 +73,7 @@ class ViewFit:
         self.given, self.sure = noise, views.weights
         self.noise = noise or views.noise(motion=fps is not None)
         self.shift = views.rays.new_zeros(*views.rays.shape[1:3], 3)
+        self.others: Tensor | None = None  # turns of the joints that points say nothing of; None at rest
         self.pose = Pose.begin(model.mean.expand(len(self.shift), -1, 3, 3), self.shift[:, 0])
 
     def __call__(self, initial: InversionResult | None) -> PointResult:
@@ -88,7 +87,8 @@ class ViewFit:
         if not bool(self.valid.any()):
             return
         if initial is not None:
-            self.pose = initial.pose()
+            self.others = initial.rotations.detach()
+            self.pose = self.model.pose(self.others, initial.translation.detach())
             return
         points, weights = self.views.triangulated()
         if bool(((weights > 0).sum(1) >= 2 * FEWEST).any()):
@@ -235,11 +235,12 @@ class ViewFit:
     def _correct(self) -> None:
         """What twist joints and correctives do to the points, beside plain skinning."""
         layer, places, pose, scale = self.model.layer, self.model.places, self.pose, self.bone_scale
+        rotations = self.model.rotations(pose, self.others)
         plain = self._points() - self.shift
         for first in range(0, len(self.valid), 256):
             part = slice(first, first + 256)
             posed = layer.pose(
-                part_of(self.identity, part), pose.relative[part, 1:], pose.translation[part],
+                part_of(self.identity, part), rotations[part], pose.translation[part],
                 bone_scale=scale if scale is None or len(scale) == 1 else scale[part],
             )  # fmt: skip
             points = places(posed.transforms, posed.vertices[:, places.vertex_ids])
@@ -252,11 +253,11 @@ class ViewFit:
         mass = views.weights.sum((0, 2)).clamp_min(1e-12)
         residual = ((views.weights * misses.square()).sum((0, 2)) / mass).sqrt()
         std = self.model.spread.repeat(len(valid), 1)
-        std[:, self.model.solver.variables] = self._rows(None).angle_std(pose).to(std)
+        std[:, self.model.kept[1:]] = self._rows(None).angle_std(pose).to(std)
         posed = valid | (self.fps is not None and bool(valid.any()))
         eye = torch.eye(3).to(misses)
         return PointResult(
-            rotations=torch.where(posed[:, None, None, None], pose.relative, eye)[:, 1:],
+            rotations=torch.where(posed[:, None, None, None], self.model.rotations(pose, self.others), eye),
             translation=torch.where(posed[:, None], pose.translation, 0.0),
             vertex_error=misses.masked_fill(~((views.weights > 0) & valid[:, None]), torch.nan).nanmean(0),
             valid=valid,

@@ -28,7 +28,7 @@ from soma_core.points.point_set import load_point_set
 from soma_core.topology.frames import METRES
 
 if TYPE_CHECKING:
-    from soma_core.inversion.point_fit import PointResult
+    from soma_core.inversion.result import PointResult
     from soma_core.skeleton.identity import Identity
 
 __all__ = ["Pointed", "from_points"]

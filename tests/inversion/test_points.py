@@ -149,6 +149,25 @@ def test_other_bodies_and_bone_lengths() -> None:
     assert without.noise > 1e-3
 
 
+def test_no_frames_are_none() -> None:
+    for name in ("smpl22", "coco17"):
+        inversion = PointInversion(LAYER, name)
+        result = inversion(torch.zeros(0, len(inversion.points), 3), IDENTITY)
+        assert result.rotations.shape == (0, 77, 3, 3)
+        assert result.point_error.shape == (0, len(inversion.points))
+
+
+def test_joints_without_points_keep_the_turns_they_began_with() -> None:
+    turns = axis_angle_to_matrix(0.5 * _poses(4, 6))
+    points, inversion = LAYER.points(LAYER.joints(IDENTITY, turns), "smpl22"), PointInversion(LAYER, "smpl22")
+    first = inversion(points, IDENTITY)
+    hands = [row for row, name in enumerate(NAMES) if "HandIndex" in name]
+    begun = replace(first, rotations=first.rotations.index_copy(1, torch.tensor(hands), turns[:, hands]))
+    for fps in (None, 30.0):
+        again = inversion(points, IDENTITY, initial=begun, fps=fps)
+        assert torch.equal(again.rotations[:, hands], turns[:, hands])
+
+
 @pytest.mark.parametrize(
     ("points", "said"),
     [

@@ -22,7 +22,7 @@ def starts(name, dtype, count):
     inversion = PointInversion(layer, name, kernels="warp")
     start, rest = inversion.start, inversion.model.rest(body)
     weights = (randn(count, points.shape[1], seed=1) + 0.5).clamp_min(0).to(dtype)
-    return start, (rest, points, weights, start._expected(rest))
+    return start, (rest, points, weights, start.expected(rest))
 
 
 @pytest.mark.parametrize("dtype", DTYPES)
