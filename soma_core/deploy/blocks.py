@@ -8,6 +8,8 @@ import torch
 from torch import Tensor
 
 from soma_core.animation.skinning import Skinning
+from soma_core.correctives.model import Correctives
+from soma_core.deploy.correctives import BatchedCorrectives
 from soma_core.geometry.constants import constant
 from soma_core.geometry.sparse import SparseRows
 
@@ -118,9 +120,9 @@ class BlockSkinning(torch.nn.Module):
 
     def forward(self, points: Tensor, transforms: Tensor, *, rows: bool) -> Tensor:
         """Skinned vertices: (B, v, 3) when `rows`, else planes (3, v, B); takes what ``Skinning`` does."""
-        x, y, z, one = (column @ self.weights for column in transforms.permute(3, 0, 2, 1))
-        place = points.permute(0, 2, 1)[:, :, None]
-        skinned = x * place[0] + y * place[1] + z * place[2] + one
+        blended = transforms.permute(0, 2, 3, 1).flatten(1, 2) @ self.weights  # all twelve numbers in one
+        place = torch.nn.functional.pad(points.permute(2, 0, 1), (0, 0, 0, 1), value=1.0)
+        skinned = (blended.unflatten(1, (3, 4)) * place[:, None]).sum(2)
         return skinned.transpose(1, 2) if rows else skinned.permute(1, 2, 0)
 
     def shared(self, vertices: Tensor, transforms: Tensor) -> Tensor:
@@ -137,6 +139,8 @@ def without_sparse(module: torch.nn.Module, *, dtype: torch.dtype, device: torch
             continue
         if isinstance(child, Skinning):
             setattr(module, name, BlockSkinning(child.weights.scipy(), dtype=dtype, device=device))
+        elif isinstance(child, Correctives) and len(child.owner):
+            setattr(module, name, BatchedCorrectives(child, dtype=dtype, device=device))
         elif isinstance(child, SparseRows):
             setattr(module, name, BlockRows(child.scipy(), dtype=dtype, device=device))
         else:

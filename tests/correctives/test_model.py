@@ -9,6 +9,7 @@ import torch
 from soma_core.cache import file_sha256
 from soma_core.correctives.model import Correctives, find_correctives, load_correctives
 from soma_core.correctives.weights import write_weights
+from soma_core.deploy.correctives import BatchedCorrectives
 from soma_core.errors import AssetError
 from soma_core.geometry.rotations import axis_angle_to_matrix
 from soma_core.layer import SomaLayer
@@ -46,6 +47,12 @@ def test_equals_the_dense_formula(model, weights, poses):
     active = torch.tanh(torch.relu(features.flatten(1) @ torch.as_tensor(weights.first.toarray())))
     dense = (active @ torch.as_tensor(weights.second.toarray())).view(len(poses), -1, 3)
     torch.testing.assert_close(model.offsets(features), dense, atol=ROUNDING, rtol=0)
+
+
+def test_batched_products_give_the_same(model, bind_pose, poses, bind):
+    batched = BatchedCorrectives(model, dtype=torch.float64, device=CPU)
+    torch.testing.assert_close(batched(poses, bind), model(poses, bind), atol=ROUNDING, rtol=0)
+    assert batched(bind_pose, bind).abs().max() < ROUNDING
 
 
 def test_zero_at_the_bind_pose(model, bind_pose, bind):

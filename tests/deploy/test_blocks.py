@@ -1,5 +1,7 @@
 """Blocks give the sparse product, whatever the pattern, and hold far fewer zeros than the dense matrix."""
 
+import itertools
+
 import numpy as np
 import pytest
 import scipy.sparse
@@ -8,6 +10,7 @@ import torch
 from soma_core.animation.skinning import Skinning
 from soma_core.deploy import blocks
 from soma_core.deploy.blocks import BlockRows, BlockSkinning, split_rows
+from soma_core.deploy.correctives import alike, equal_parts
 from tests.bodies import CPU, randn
 
 ROUNDING = 1e-12
@@ -72,3 +75,25 @@ def test_skinning_is_that_of_the_layer(bodies, rows):
     assert (found - wanted).abs().max() < ROUNDING
     one = points[:, :, 0].T
     assert (mine.shared(one, transforms) - theirs.shared(one, transforms)).abs().max() < ROUNDING
+
+
+@pytest.mark.parametrize("widths", [[9, 9, 8, 5, 5, 5, 2, 1], [3], [4, 4, 4]])
+@pytest.mark.parametrize("parts", [1, 2, 3])
+def test_runs_of_equal_width_waste_least(widths, parts):
+    wide = np.array(widths)
+
+    def waste(ends):
+        begins = [0, *ends[:-1]]
+        return sum((end - begin) * wide[begin] for begin, end in zip(begins, ends, strict=True)) - wide.sum()
+
+    found = equal_parts(wide, parts)
+    cuts = itertools.combinations(range(1, len(wide)), min(parts, len(set(widths))) - 1)
+    assert found[-1] == len(wide)
+    assert waste(found) == min(waste([*cut, len(wide)]) for cut in cuts)
+
+
+def test_rows_that_use_the_same_columns_stand_together():
+    _, dense = patchy(60, 12)
+    kinds = [tuple(row) for row in (dense != 0)[alike(dense != 0)]]
+    assert sum(kinds[i] != kinds[i + 1] for i in range(59)) == len(set(kinds)) - 1
+    assert sorted(alike(dense != 0)) == list(range(60))
