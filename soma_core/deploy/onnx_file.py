@@ -47,6 +47,7 @@ def write_onnx(path: Path, model: DeployedModel) -> None:
         )  # fmt: skip
     assert made is not None
     optimizer.fold_constants(made.model)
+    _shape_once(made.model.graph)
     optimizer.remove_unused_nodes(made.model)  # its whole optimizer takes minutes for some thousand nodes
     graph = made.model.graph
     for node in graph.all_nodes():
@@ -58,6 +59,21 @@ def write_onnx(path: Path, model: DeployedModel) -> None:
         text = value if isinstance(value, str) else json.dumps(value)
         made.model.metadata_props[f"soma.{name}"] = text
     atomic_write(path, made.save)
+
+
+def _shape_once(graph: Any) -> None:
+    """Make constants of shapes in which nothing but the batch is open: an engine puts each together anew."""
+    ir = need_onnx("onnxscript", "ir").ir
+    for node in graph.all_nodes():
+        shape = node.inputs[1].producer() if node.op_type == "Reshape" else None
+        if shape is None or shape.op_type != "Concat":
+            continue
+        parts = [ir.convenience.get_const_tensor(value) for value in shape.inputs]
+        if sum(part is None for part in parts) == 1:
+            sizes = [np.array([-1]) if part is None else part.numpy() for part in parts]
+            fixed = ir.node("Constant", [], {"value": ir.tensor(np.concatenate(sizes).astype(np.int64))})
+            graph.insert_before(node, fixed)
+            node.replace_input_with(1, fixed.outputs[0])
 
 
 def write_program(path: Path, model: DeployedModel) -> None:
