@@ -8,9 +8,11 @@ import torch
 from torch import Tensor
 
 from soma_core.animation.skinning import Skinning
+from soma_core.animation.twist import Twist
 from soma_core.correctives.model import Correctives
 from soma_core.deploy.correctives import BatchedCorrectives
 from soma_core.deploy.fit import ShortRotationFit
+from soma_core.deploy.turns import ShortTwist
 from soma_core.geometry.constants import constant
 from soma_core.geometry.sparse import SparseRows
 from soma_core.skeleton.rotations import RotationFit
@@ -143,6 +145,8 @@ def without_sparse(module: torch.nn.Module, *, dtype: torch.dtype, device: torch
             setattr(module, name, BlockSkinning(child.weights.scipy(), dtype=dtype, device=device))
         elif isinstance(child, Correctives) and len(child.owner):
             setattr(module, name, BatchedCorrectives(child, dtype=dtype, device=device))
+        elif isinstance(child, Twist) and not any(child.counts[1:]):
+            setattr(module, name, ShortTwist(child, dtype=dtype, device=device))
         elif isinstance(child, RotationFit):
             setattr(module, name, ShortRotationFit(child, dtype=dtype, device=device))
         elif isinstance(child, SparseRows):

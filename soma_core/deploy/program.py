@@ -14,8 +14,8 @@ from soma_core.animation.engine import Body
 from soma_core.backends.parameters import batch_parameters
 from soma_core.choices import ModelPart
 from soma_core.deploy.blocks import without_sparse
+from soma_core.deploy.turns import AxisAngle
 from soma_core.errors import InputError
-from soma_core.geometry.rotations import axis_angle_to_matrix
 from soma_core.layer import SomaLayer
 from soma_core.plugin.declaration import did_you_mean
 
@@ -62,6 +62,7 @@ class _Body(torch.nn.Module):
     ) -> None:
         super().__init__()
         self.part, self.fixed, self.names, self._layer = part, dict(fixed), tuple(names), [layer]
+        self.turn = AxisAngle(dtype=layer.dtype, device=layer.device)
         with torch.no_grad():
             self.identity = None if part is ModelPart.full else layer.identity(self.fixed)
 
@@ -72,7 +73,9 @@ class _Body(torch.nn.Module):
             batch = rotations.shape[0]
             params = {name: value.expand(batch, *value.shape[1:]) for name, value in given.items()}
             identity = layer._identity(params, *layer.rest_shape(params))
-        body = Body(identity, axis_angle_to_matrix(rotations), translation)
+        vectors = rotations.permute(2, 1, 0)
+        turns = self.turn.exponential(vectors.flatten(1)).view(3, 3, *vectors.shape[1:])
+        body = Body(identity, turns.permute(3, 2, 0, 1), translation)
         if self.part is ModelPart.joints:
             world = layer.animation.transforms(body, absolute=False)
             return world[:, 1:, :3, 3], world
