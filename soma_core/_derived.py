@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable, Mapping
-from typing import Any, Self, TypeVar, cast
+from typing import Any, ClassVar, Self, TypeVar, cast
 
 import torch
 from torch import Tensor
 
 from soma_core._inputs import check_choice, usable_device
+from soma_core.errors import InputError, check_type
 
-__all__ = ["Derived", "own_precision"]
+__all__ = ["Derived", "kind_of", "own_precision"]
 
 _DTYPES = (torch.float32, torch.float64)
 _Method = TypeVar("_Method", bound=Callable[..., Any])
@@ -28,12 +29,19 @@ class Derived(torch.nn.Module):
         given: arguments of the constructor; others that are in it, such as `self`, do not matter.
         device, dtype: of all constants and results.
 
+    Attributes:
+        takes: types of arguments, and what to do about others; of a class, checked when it is made.
+
     Raises:
-        InputError: neither float32 nor float64, or no such device here.
+        InputError: an argument of another type, neither float32 nor float64, or no such device here.
     """
+
+    takes: ClassVar[Mapping[str, tuple[tuple[type, ...], str]]] = {}
 
     def __init__(self, given: Mapping[str, Any], device: torch.device | str, dtype: torch.dtype) -> None:
         super().__init__()
+        for name, (kinds, fix) in self.takes.items():
+            check_type(name, given[name], *kinds, fix=fix)
         check_choice("dtype", dtype, _DTYPES)
         self._given: dict[str, Any] = {
             name: dict(value) if isinstance(value, Mapping) else value
@@ -81,6 +89,14 @@ class Derived(torch.nn.Module):
         modules = {name: value for name, value in given.items() if isinstance(value, torch.nn.Module)}
         rest = {name: value for name, value in given.items() if name not in modules}
         return functools.partial(type(self), **rest), tuple(modules.values()), {"training": self.training}
+
+
+def kind_of(layer: Derived) -> tuple[torch.device, torch.dtype]:
+    """Device and dtype of a layer; what is no layer is refused (InputError)."""
+    if not isinstance(layer, Derived):
+        fix = "Make one: SomaLayer('soma')."
+        raise InputError("layer", got=f"one of type {type(layer).__name__}", expected="SomaLayer", fix=fix)
+    return layer.device, layer.dtype
 
 
 def own_precision(method: _Method) -> _Method:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-__all__ = ["AssetError", "InputError", "SomaError"]
+__all__ = ["AssetError", "InputError", "SomaError", "check_type"]
 
 
 class SomaError(Exception):
@@ -54,3 +54,13 @@ class AssetError(SomaError):
     def __init__(self, path: object, *, cause: str, fix: str) -> None:
         self.path, self.cause, self.fix = str(path), cause, fix
         super().__init__(f"{path}: {_told(cause)}. {fix}")
+
+
+def check_type(argument: str, value: object, *kinds: type, fix: str) -> None:
+    """Refuse (InputError) what is of none of these types."""
+    if isinstance(value, kinds):
+        return
+    names = ["None" if kind is type(None) else kind.__name__ for kind in kinds]
+    plain = isinstance(value, str | int | float)
+    got = f"{value!r} ({type(value).__name__})" if plain else f"a value of type {type(value).__name__}"
+    raise InputError(argument, got=got, expected=" or ".join(names), fix=fix)

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import functools
+import os
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, cast, get_args
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, cast, get_args
 
 import torch
 from torch import Tensor
@@ -28,7 +29,7 @@ from soma_core.backends.parameters import batch_parameters
 from soma_core.backends.rest_shape import make_rest_shape
 from soma_core.compiled import CompiledLayer
 from soma_core.correctives.model import find_correctives, load_correctives
-from soma_core.errors import InputError
+from soma_core.errors import check_type
 from soma_core.geometry.torch_func import untracked
 from soma_core.kernels.ahead import kernels_ahead
 from soma_core.paths import expanded
@@ -77,6 +78,12 @@ class SomaLayer(PartialBodies):
         InputError, BackendError: an unknown choice; the backend is not installed or does not build.
         AssetError: a checkpoint is missing, damaged or made for another rig.
     """
+
+    takes: ClassVar = {
+        "options": ((Mapping, type(None)), "Give each by its name: {'NAME': value}."),
+        **dict.fromkeys(("correctives", "assets"), ((str, os.PathLike, type(None)), "Name it, or None.")),
+        **dict.fromkeys(("exact", "repose", "procedural", "validate"), ((bool,), "Pass True or False.")),
+    }
 
     def __init__(
         self,
@@ -158,10 +165,8 @@ class SomaLayer(PartialBodies):
 
     def extra_repr(self) -> str:
         """What was chosen, for ``repr``."""
-        return (
-            f"backend={self.backend!r}, lod={self.mesh.lod!r}, procedural={self.procedural}, "
-            f"correctives={str(self.correctives_file) if self.correctives_file else None!r}"
-        )
+        made = f"backend={self.backend!r}, lod={self.mesh.lod!r}, procedural={self.procedural}"
+        return f"{made}, correctives={str(self.correctives_file) if self.correctives_file else None!r}"
 
     @property
     def faces(self) -> Any:
@@ -338,14 +343,8 @@ class SomaLayer(PartialBodies):
 
     def check_identity(self, identity: Identity) -> None:
         """Refuse (InputError) one that another kind of layer made: other rig, LOD, dtype or device."""
-        same_rig = not identity.rig_revision or identity.rig_revision == self.rig.revision
-        if not same_rig or identity.rest.shape[1] != self.mesh.vertex_count:
-            raise InputError(
-                "identity",
-                got=f"{identity.rest.shape[1]} vertices on rig {identity.rig_revision or 'unknown'}",
-                expected=f"{self.mesh.vertex_count} vertices on rig {self.rig.revision}",
-                fix="Make it with this layer's identity().",
-            )
+        check_type("identity", identity, Identity, fix="Make one: layer.identity(params).")
+        identity.check(self.mesh.vertex_count, self.rig.revision)
         check_kind("identity", identity.rest, self.dtype, self.device)
 
     @own_precision

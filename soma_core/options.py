@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from enum import StrEnum
 from os import PathLike
 from types import UnionType
-from typing import Any, get_args, get_origin, get_type_hints
+from typing import Any, Self, get_args, get_origin, get_type_hints
 
 from soma_core.choices import (
     BvhRest,
@@ -21,7 +21,7 @@ from soma_core.choices import (
     Lod,
     Skinning,
 )
-from soma_core.errors import InputError
+from soma_core.errors import InputError, check_type
 
 __all__ = [
     "AnalyticalChoice",
@@ -48,6 +48,13 @@ class Options:
     Raises:
         InputError: another name than those of the choice, or a value of another type than the field's.
     """
+
+    @classmethod
+    def or_default(cls, options: Self | None) -> Self:
+        """Those that a function was given, or the defaults for None; others are refused (InputError)."""
+        if options is not None:
+            check_type("options", options, cls, fix=f"Pass {cls.__name__}(...), or leave it out.")
+        return cls() if options is None else options
 
     def __setattr__(self, name: str, value: object) -> None:
         """Set a field that is not set yet."""

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from soma_core._inputs import may_look, widened
-from soma_core.errors import InputError
+from soma_core.errors import InputError, check_type
 from soma_core.plugin.spec import BackendSpec, Parameter
 
 __all__ = ["batch_parameters"]
@@ -37,7 +37,9 @@ def batch_parameters(
         InputError: unknown name, wrong shape, batch sizes that disagree, NaN or infinity, an
             integer, boolean or complex array, a tensor on another device or of another dtype.
     """
-    given = dict(params or {})
+    params = {} if params is None else params
+    check_type("params", params, Mapping, fix="Give each by its name: {'NAME': value}.")
+    given = dict(params)
     declared = {parameter.name: parameter for parameter in spec.params}
     for name in given:
         if name not in declared:

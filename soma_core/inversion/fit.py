@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Literal, get_args
 import torch
 from torch import Tensor
 
-from soma_core._derived import Derived, own_precision
+from soma_core._derived import Derived, kind_of, own_precision
 from soma_core._inputs import check_bone_scale, check_choice
 from soma_core.geometry.constants import constant
 from soma_core.inversion._inputs import (
@@ -102,7 +102,7 @@ class PoseInversion(Derived):
         priors: PosePriors | None = None,
         kernels: Kernels = "auto",
     ) -> None:
-        super().__init__(locals(), layer.device, layer.dtype)
+        super().__init__(locals(), *kind_of(layer))
         self.options = LadderOptions(
             stages=stages, iterations=iterations, tolerance=tolerance, robust=robust,
             robust_rounds=robust_rounds, refreshes=refreshes, skinning=skinning,

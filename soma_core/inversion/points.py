@@ -4,15 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from numbers import Real
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
-from soma_core._derived import Derived, own_precision
+from soma_core._derived import Derived, kind_of, own_precision
 from soma_core._inputs import check_bone_scale, check_choice
-from soma_core.errors import InputError
+from soma_core.errors import InputError, check_type
 from soma_core.inversion._inputs import check_weights, refuse_transforms
 from soma_core.inversion.point_fit import SEVERAL, PointFit
 from soma_core.inversion.point_gradient import attach_point_gradient
@@ -67,8 +68,11 @@ class PointInversion(Derived):
         iterations: int = 20,
         kernels: Kernels = "auto",
     ) -> None:
-        super().__init__(locals(), layer.device, layer.dtype)
+        super().__init__(locals(), *kind_of(layer))
         check_choice("kernels", kernels, ("auto", "torch", "warp"))
+        check_type("prior", prior, JointPrior, type(None), fix="Pass JointPrior(...), or None.")
+        check_type("noise", noise, Real, type(None), fix="Leave it out to have it estimated.")
+        check_type("iterations", iterations, int, fix="Leave it out for 20.")
         if noise is not None and not 0 < noise < torch.inf:
             raise InputError(
                 "noise",

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from soma_core.errors import InputError
+from soma_core.errors import InputError, check_type
 from soma_core.geometry.constants import Kind
 from soma_core.geometry.kabsch import rotation_from_covariance
 from soma_core.geometry.rotations import axis_angle_to_matrix
@@ -269,8 +269,9 @@ def joint_terms(
     Raises:
         InputError: a joint that no fit can determine, an axis of no length, a negative strength.
     """
+    check_type("priors", priors, PosePriors, fix="Pass PosePriors(...), or None.")
     for key in ("limit_strength", "rest_strength", "temporal_strength", "expected"):
-        if getattr(priors, key) < 0:
+        if not getattr(priors, key) >= 0:
             raise InputError(f"priors.{key}", got=getattr(priors, key), expected="at least 0", fix="Use 0.")
     strength = priors.limit_strength
     rows = [(_find(name, names, "limits"), strength, limit) for name, limit in priors.limits.items()]

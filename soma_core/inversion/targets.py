@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from numbers import Real
 from typing import Literal, get_args
 
 from torch import Tensor
 
 from soma_core._inputs import check_choice
-from soma_core.errors import InputError
+from soma_core.errors import InputError, check_type
 from soma_core.inversion.analytical import AnalyticalOptions
 from soma_core.inversion.autograd import AutogradOptions
 from soma_core.inversion.model import PoseModel
@@ -24,6 +25,13 @@ __all__ = ["Frames", "LadderOptions", "Skinning", "Stage", "Targets"]
 Stage = Literal["procrustes", "transfer", "analytical", "gauss_newton", "autograd"]
 
 Skinning = Literal["auto", "full", "plain"]
+
+
+_TYPES = {
+    **dict.fromkeys(("iterations", "refreshes", "robust_rounds"), (int,)),
+    "tolerance": (Real,), "robust": (Real, type(None)),
+    "analytical": (AnalyticalOptions,), "autograd": (AutogradOptions,),
+}  # fmt: skip
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -62,6 +70,8 @@ class LadderOptions:
     skinning: Skinning = "auto"
 
     def __post_init__(self) -> None:
+        for name, kinds in _TYPES.items():
+            check_type(name, getattr(self, name), *kinds, fix=f"Leave {name} out for the default.")
         check_choice("skinning", self.skinning, get_args(Skinning))
         names = get_args(Stage)
         for stage in self.stages:

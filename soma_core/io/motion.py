@@ -4,14 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from numbers import Real
 from typing import Literal
 
 import numpy as np
 
-from soma_core.errors import InputError
+from soma_core.errors import InputError, check_type
 from soma_core.io.joint_order import CONTACT_JOINTS
 
-__all__ = ["Convention", "Motion"]
+__all__ = ["Convention", "Motion", "check_motion"]
 
 Convention = Literal["t_pose_relative", "absolute_local"]
 
@@ -61,6 +62,11 @@ class Motion:
     expression: np.ndarray | None = None
 
     def __post_init__(self) -> None:
+        check_type("identity", self.identity, Mapping, fix="Give {} where none is known.")
+        if len(set(self.joint_names)) < len(self.joint_names):
+            raise InputError(
+                "joint_names", got="a name twice", expected="one for each joint", fix="Name each once."
+            )
         rotations = np.asarray(self.rotations, np.float32)
         translation = np.asarray(self.translation, np.float32)
         object.__setattr__(self, "rotations", rotations)
@@ -71,10 +77,10 @@ class Motion:
         self._check_recorded(frames)
         if frames == 0:
             raise InputError("rotations", got="0 frames", expected="at least one", fix="Give a longer clip.")
-        if not 0 < self.fps <= _MOST_FPS:
+        if not (isinstance(self.fps, Real) and 0 < self.fps <= _MOST_FPS):
             raise InputError(
                 "fps",
-                got=self.fps,
+                got=repr(self.fps),
                 expected=f"a positive number, at most {_MOST_FPS:,}",
                 fix="Give the frame rate in frames per second.",
             )
@@ -115,6 +121,11 @@ class Motion:
         names = ("rotations", "translation", "contacts", "expression")
         kept = {name: value for name in names if (value := getattr(self, name)) is not None}
         return replace(self, **{name: value[frames] for name, value in kept.items()})
+
+
+def check_motion(motion: object) -> None:
+    """Refuse (InputError) what is no motion on this skeleton."""
+    check_type("motion", motion, Motion, fix="Read one: soma_core.motion.read(path), or convert(path).")
 
 
 def _expect(argument: str, array: np.ndarray, shape: tuple[int, ...]) -> None:

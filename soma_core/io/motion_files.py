@@ -18,7 +18,7 @@ from soma_core.io.data_files import DATA_SUFFIXES, open_data
 from soma_core.io.gem_x import gem_x_motion, gem_x_parts, gem_x_result
 from soma_core.io.joint_order import USER_JOINTS
 from soma_core.io.kimodo_npz import read_kimodo_npz
-from soma_core.io.motion import Convention, Motion
+from soma_core.io.motion import Convention, Motion, check_motion
 from soma_core.io.npz_fields import check_rotations, open_npz
 from soma_core.io.npz_parts import write_npz_parts
 from soma_core.io.soma_npz import SCHEMA_VERSION, read_soma_npz
@@ -123,6 +123,7 @@ def write_motion(
     Raises:
         InputError: the joints are not the 77 user joints in order, or a matrix is no rotation.
     """
+    check_motion(motion)
     _check_joints(motion)
     check_rotations("motion.rotations", motion.rotations.astype(np.float64))
     arrays = _arrays(motion, rotation_repr)

@@ -10,9 +10,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 
+from soma_core._derived import kind_of
 from soma_core.choices import Contacts, Ground, Translation
 from soma_core.errors import InputError
-from soma_core.io.motion import Motion
+from soma_core.io.motion import Motion, check_motion
 from soma_core.io.motion_files import check_rig
 from soma_core.layer import SomaLayer
 from soma_core.motion.foot_lock import lock_feet
@@ -91,6 +92,9 @@ def animate(
         InputError: absolute rotations that were made for another rig; a frame to keep that there is not;
             a choice that there is not, or that does not go with `translation`.
     """
+    kind_of(layer)
+    check_motion(motion)
+    layer.check_identity(identity)
     _say_rig(layer, motion)
     ground = _ground_choice(translation, ground, contacts)
     wanted = set(keep or ())

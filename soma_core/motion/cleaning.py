@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
+from numbers import Real
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -15,10 +16,11 @@ from scipy.linalg import solveh_banded
 from scipy.ndimage import median_filter
 from scipy.spatial.transform import Rotation, Slerp
 
+from soma_core._derived import kind_of
 from soma_core.choices import Smooth
-from soma_core.errors import InputError
+from soma_core.errors import InputError, check_type
 from soma_core.io.joint_order import USER_JOINTS, other_sides
-from soma_core.io.motion import Motion
+from soma_core.io.motion import Motion, check_motion
 from soma_core.motion.options import CleanOptions, LimbSeconds
 from soma_core.motion.quality import motion_quality, relative_rotations
 from soma_core.rig import load_canonical
@@ -86,7 +88,8 @@ def clean(motion: Motion, *, options: CleanOptions | None = None) -> Cleaned:
     Raises:
         InputError: a rate that is none.
     """
-    options = options or CleanOptions()
+    options = CleanOptions.or_default(options)
+    check_motion(motion)
     steady, spikes = without_spikes(motion) if options.spikes else (motion, {})
     smoothed = smooth(steady, _gains(options))
     found = smoothed if options.rate is None else resample(smoothed, options.rate)
@@ -119,6 +122,7 @@ def without_spikes(motion: Motion) -> tuple[Motion, dict[str, list[int]]]:
     Returns:
         The motion, and the frames that were replaced, by joint; ``path`` is that of the Hips.
     """
+    check_motion(motion)
     found: dict[str, set[int]] = {}
     for _ in range(_ROUNDS):
         motion, replaced = _round(motion)
@@ -160,6 +164,8 @@ def smooth(motion: Motion, seconds: LimbSeconds) -> Motion:
         motion: of any length; fewer than four frames stay as they are.
         seconds: s of each limb [s]; None and 0 leave it alone.
     """
+    check_motion(motion)
+    check_type("seconds", seconds, LimbSeconds, fix="Pass LimbSeconds(arms=0.1, ...).")
     if motion.frame_count < 4:
         return motion
     rotations, translation = motion.rotations.copy(), motion.translation
@@ -189,8 +195,9 @@ def resample(motion: Motion, fps: float) -> Motion:
     Raises:
         InputError: the rate is no positive number.
     """
-    if not (np.isfinite(fps) and fps > 0):
-        raise InputError("rate", got=fps, expected="frames per second", fix="Try rate=30.")
+    check_motion(motion)
+    if not (isinstance(fps, Real) and np.isfinite(fps) and fps > 0):
+        raise InputError("rate", got=repr(fps), expected="frames per second", fix="Try rate=30.")
     if fps == motion.fps or motion.frame_count == 1:
         return motion if motion.fps == fps else replace(motion, fps=fps)
     own, last = np.arange(motion.frame_count), motion.frame_count - 1
@@ -219,6 +226,7 @@ def mirror(motion: Motion) -> Motion:
     Args:
         motion: any. Its body's parameters, which know no sides, are kept.
     """
+    check_motion(motion)
     flip, other = np.array([-1.0, 1.0, 1.0], np.float32), other_sides(motion.joint_names)
     rotations = _reflected(relative_rotations(motion), other)
     if motion.convention == "absolute_local":
@@ -243,6 +251,8 @@ def mirrored_body(layer: SomaLayer, identity: Identity) -> Identity:
         layer: whose mesh and rig the body is of.
         identity: any number of them; their parameters are kept, and are those of the body before.
     """
+    kind_of(layer)
+    layer.check_identity(identity)
     other = [0, *(1 + row for row in other_sides(USER_JOINTS))]
     partner = torch.as_tensor(layer.mesh.mirror.astype(np.int64), device=identity.rest.device)
     flip = identity.rest.new_tensor([-1.0, 1.0, 1.0])

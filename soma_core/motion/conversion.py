@@ -51,7 +51,7 @@ def convert(source: str | Path, *, options: ConvertOptions | None = None) -> Mot
         SomaError: the file, or the backend that it needs, cannot be used, or the fit is none.
         InputError: the options lead to another model, which :func:`convert_file` does.
     """
-    options = options or ConvertOptions()
+    options = ConvertOptions.or_default(options)
     if options.to != "soma":
         raise InputError("to", got=options.to, expected="soma", fix="Use convert_file for the way back.")
     with tempfile.TemporaryDirectory() as folder:
@@ -152,7 +152,7 @@ def convert_file(source: str | Path, out: str | Path, *, options: ConvertOptions
         InputError: it holds no motion, or was converted before with other settings.
     """
     out = Path(out)
-    convert = converter_for(options or ConvertOptions())
+    convert = converter_for(ConvertOptions.or_default(options))
     return convert(expanded(source), ResultFiles.of_folder(out), out / "chunks")
 
 
@@ -170,7 +170,7 @@ def convert_people(
         SomaError: the file, or the backend that it needs, cannot be used, or a fit is none.
     """
     source, out = Path(source).expanduser(), Path(out)
-    convert = Converter(options or ConvertOptions())
+    convert = Converter(ConvertOptions.or_default(options))
     return {
         person: convert.of_person(person)(source, ResultFiles.of_folder(out / name), out / name / "chunks")
         for person, name in people_names(source).items()

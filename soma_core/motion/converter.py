@@ -255,7 +255,7 @@ def invert(source: str | Path, out: str | Path, *, options: InvertOptions | None
         SomaError: the backend or the file cannot be used, or the fit is none; what there is of it is
             written all the same.
     """
-    source, out, options = expanded(source), Path(out), options or InvertOptions()
+    source, out, options = expanded(source), Path(out), InvertOptions.or_default(options)
     files = ResultFiles.of_folder(out)
     if options.points is not None:
         with heard() as said:
@@ -293,7 +293,8 @@ def plan_fit(
         expanded(source).resolve(),
         Path(out).resolve(),
     )  # another process may stand elsewhere
-    options = options or ConvertOptions()
+    if not isinstance(options, InvertOptions):
+        options = ConvertOptions.or_default(options)
     layout = "vertices" if isinstance(options, InvertOptions) else _known_layout(source)
     if not is_fitted(layout):
         raise InputError(

@@ -283,9 +283,16 @@ def _with_sides_swapped(motion: Motion) -> Motion:
 def write(motion: Motion, path: str | Path) -> None:
     """Write a motion in this project's schema, atomically; the SOMA tools read it as well.
 
+    Args:
+        motion: what to write; metres, +Y up.
+        path: the NPZ file. :func:`write_bvh` and :func:`write_body` write others.
+
     Raises:
-        InputError: the joints are not the 77 user joints in order, or a matrix is no rotation.
+        InputError: another suffix, other joints than the 77 user joints in order, or a matrix is no rotation.
     """
+    if Path(path).suffix != ".npz":
+        others = "write_bvh and write_body of soma_core.motion write BVH, GLB, USD and HTML"
+        raise InputError("path", got=repr(Path(path).name), expected=".npz", fix=f"Name it so; {others}.")
     write_motion(motion, path, joint_orient=load_canonical("mid")[1].t_pose_world[1:, :3, :3])
 
 

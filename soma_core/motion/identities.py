@@ -11,8 +11,9 @@ from typing import Any
 import numpy as np
 import torch
 
+from soma_core._derived import kind_of
 from soma_core.cache import atomic_write
-from soma_core.errors import InputError
+from soma_core.errors import InputError, check_type
 from soma_core.inversion.result import IdentityFit
 from soma_core.io.motion import Motion
 from soma_core.layer import SomaLayer
@@ -56,6 +57,8 @@ def stored_identity(layer: SomaLayer, stored: Mapping[str, Any]) -> Identity:
     Raises:
         InputError: parameters or a rest shape that the layer does not take.
     """
+    kind_of(layer)
+    check_type("stored", stored, Mapping, fix="Give what a motion keeps: motion.identity.")
     rest = stored.get("rest")
     if rest is None:
         return layer.identity(stored.get("params"))

@@ -316,7 +316,7 @@ class DatasetOptions(ConvertOptions):
     @classmethod
     def of(cls, options: ConvertOptions | None, **changes: Any) -> DatasetOptions:
         """These options alone, of a conversion or of what a command adds to them."""
-        given = options or ConvertOptions()
+        given = ConvertOptions.or_default(options)
         known = {each.name: getattr(given, each.name) for each in fields(cls) if hasattr(given, each.name)}
         return cls(**known | changes)
 

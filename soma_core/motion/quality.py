@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from soma_core.inversion.point_priors import JointPrior, JointRange
 from soma_core.io.joint_order import CONTACT_JOINTS, USER_JOINTS
-from soma_core.io.motion import Motion
+from soma_core.io.motion import Motion, check_motion
 from soma_core.motion.ground import FootTrack, contacts_of, floor_height, rest_offsets
 from soma_core.rig import load_canonical
 
@@ -35,6 +35,7 @@ def motion_quality(motion: Motion) -> dict[str, Any]:
     Args:
         motion: any.
     """
+    check_motion(motion)
     places = joint_places(motion)
     jitter = 0.0
     if motion.frame_count > 3:

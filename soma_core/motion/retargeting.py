@@ -9,7 +9,7 @@ from typing import Any, Literal
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from soma_core.errors import InputError
+from soma_core.errors import InputError, check_type
 from soma_core.io.joint_names import match_joints
 from soma_core.io.joint_order import PARENT_NAMES, USER_JOINTS
 from soma_core.io.motion import Motion
@@ -69,6 +69,7 @@ def retarget(
     Raises:
         InputError: names that are not known, or a size that fits no unit.
     """
+    check_type("source", source, SkeletonMotion, fix="Read one: soma_core.motion.read_bvh(path).")
     if match not in _MATCHES:
         raise InputError("match", got=repr(match), expected=" or ".join(_MATCHES), fix="Correct it.")
     joints = match_joints(source.names, source.parents, mapping=mapping, source=source.source or "names")

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from soma_core.errors import InputError
+from soma_core.errors import InputError, check_type
 from soma_core.inversion._inputs import check_weights
 from soma_core.inversion.fit import PoseInversion, Topology
 from soma_core.inversion.free_parameters import FreeParameters
@@ -68,6 +68,7 @@ def fit_identity(
         InputError: an unknown method or parameter, a count below one, no usable frame.
     """
     _check(method, frames, iterations)
+    check_type("vertices", vertices, Tensor, fix="Wrap it: torch.as_tensor(vertices).")
     inversion = inversion or PoseInversion(layer)
     canonical = inversion.canonical(vertices.detach(), topology)
     weights = check_weights(weights, inversion.default_weights, len(canonical))

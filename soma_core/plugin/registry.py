@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from soma_core._version import __version__
-from soma_core.errors import InputError
+from soma_core.errors import InputError, check_type
 from soma_core.plugin.causes import supply
 from soma_core.plugin.checks import Check
 from soma_core.plugin.configs import PluginConfigs, find_configs
@@ -324,6 +324,7 @@ class Registry:
         return find_configs((record.offers[0] for record in usable), core=_CORE)
 
     def _record(self, name: str) -> Record:
+        check_type("backend", name, str, fix="Name one: `soma backends` lists them.")
         if name in self._records:
             return self._records[name]
         cause = f"no installed distribution offers it; installed are: {', '.join(self._records) or 'none'}"

@@ -20,7 +20,7 @@ from soma_core.animation.skinning import Skinning
 from soma_core.backends.parameters import batch_parameters
 from soma_core.backends.rest_shape import ComposedRestShape, ExactRestShape
 from soma_core.correctives.model import Correctives
-from soma_core.errors import InputError
+from soma_core.errors import InputError, check_type
 from soma_core.geometry.rotations import axis_angle_to_matrix
 from soma_core.geometry.sparse import SparseRows
 from soma_core.plugin.spec import BackendSpec
@@ -192,6 +192,7 @@ class PartialBodies(Derived):
         Raises:
             InputError: an id that the mesh does not have; a mesh that is reduced from another (xlo).
         """
+        check_type("vertices", ids, Tensor, list, tuple, range, np.ndarray, fix="Give ids of the mesh.")
         given = torch.as_tensor(ids).reshape(-1)
         count = self.mesh.vertex_count
         if given.is_floating_point() or bool(((given < 0) | (given >= count)).any()):
@@ -242,6 +243,7 @@ class PartialBodies(Derived):
             posed: of this layer.
             points: a set, its name (``soma points list``) or file, or what :meth:`places` prepared.
         """
+        check_type("posed", posed, Posed, fix="Give what layer.pose(...) returns.")
         places = points if isinstance(points, PointPlaces) else self.places(points)
         return places(posed.transforms, posed.vertices[:, places.vertex_ids])
 

@@ -8,6 +8,8 @@ from typing import Any
 
 from torch import Tensor
 
+from soma_core.errors import InputError
+
 __all__ = ["Identity"]
 
 
@@ -48,6 +50,17 @@ class Identity:
             range(len(self))[index]  # IndexError where there is none, so that it can be iterated over
             index = slice(index, index + 1 or None)
         return self._with(lambda values: values[index])
+
+    def check(self, vertices: int, revision: str) -> None:
+        """Refuse (InputError) one of another mesh or rig than these."""
+        if self.rest.shape[1] == vertices and self.rig_revision in ("", revision):
+            return
+        raise InputError(
+            "identity",
+            got=f"{self.rest.shape[1]} vertices on rig {self.rig_revision or 'unknown'}",
+            expected=f"{vertices} vertices on rig {revision}",
+            fix="Make it with this layer's identity().",
+        )
 
     def to(self, *args: Any, **kwargs: Any) -> Identity:
         """Move or convert every tensor; takes what ``torch.Tensor.to`` does."""
