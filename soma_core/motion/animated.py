@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from soma_core.animation.posed import Posed
     from soma_core.skeleton.identity import Identity
 
-__all__ = ["Animated", "animate", "standing_motion"]
+__all__ = ["Animated", "animate", "check_playable", "standing_motion"]
 
 _log = logging.getLogger(__name__)
 
@@ -61,6 +61,13 @@ class Animated:
     vertices: Mapping[int, np.ndarray]
     feet: FootTrack | None = None
     contacts: np.ndarray | None = None
+
+
+def check_playable(layer: SomaLayer, identity: Identity, motion: Motion) -> None:
+    """Refuse (InputError) what is no layer, no identity of it or no motion."""
+    kind_of(layer)
+    check_motion(motion)
+    layer.check_identity(identity)
 
 
 def animate(
@@ -92,9 +99,7 @@ def animate(
         InputError: absolute rotations that were made for another rig; a frame to keep that there is not;
             a choice that there is not, or that does not go with `translation`.
     """
-    kind_of(layer)
-    check_motion(motion)
-    layer.check_identity(identity)
+    check_playable(layer, identity, motion)
     _say_rig(layer, motion)
     ground = _ground_choice(translation, ground, contacts)
     wanted = set(keep or ())

@@ -10,14 +10,14 @@ from typing import Any
 
 import numpy as np
 
-from soma_core._derived import kind_of
 from soma_core.cache import atomic_text
 from soma_core.choices import Product
 from soma_core.io.bvh import write_bvh
 from soma_core.io.camera import Camera, read_camera
-from soma_core.io.motion import Motion, check_motion
+from soma_core.io.motion import Motion
 from soma_core.io.motion_files import read_motion
 from soma_core.layer import SomaLayer
+from soma_core.motion.animated import check_playable
 from soma_core.motion.files import ResultFiles, fingerprint, write
 from soma_core.motion.models import model_settings
 from soma_core.motion.options import ConvertOptions
@@ -159,9 +159,7 @@ def write_body(path: str | Path, layer: SomaLayer, identity: Identity, motion: M
     Raises:
         InputError: another suffix, or an identity that is a batch.
     """
-    kind_of(layer)
-    check_motion(motion)
-    layer.check_identity(identity)
+    check_playable(layer, identity, motion)
     product = {".glb": Product.glb, ".html": Product.html}.get(Path(path).suffix, Product.usd)
     played = Played(layer=layer, identity=identity, motion=motion)
     WRITERS[product].write(Path(path), *_NEEDED["body"](played, played, WriteOptions(), None))

@@ -67,8 +67,7 @@ def fit_identity(
     Raises:
         InputError: an unknown method or parameter, a count below one, no usable frame.
     """
-    _check(method, frames, iterations)
-    check_type("vertices", vertices, Tensor, fix="Wrap it: torch.as_tensor(vertices).")
+    _check(vertices, method, frames, iterations)
     inversion = inversion or PoseInversion(layer)
     canonical = inversion.canonical(vertices.detach(), topology)
     weights = check_weights(weights, inversion.default_weights, len(canonical))
@@ -93,7 +92,8 @@ def fit_identity(
     )  # fmt: skip
 
 
-def _check(method: str, frames: int, iterations: int) -> None:
+def _check(vertices: object, method: str, frames: int, iterations: int) -> None:
+    check_type("vertices", vertices, Tensor, fix="Wrap it: torch.as_tensor(vertices).")
     if method not in get_args(IdentityMethod):
         among = "'backend' or 'unpose'"
         raise InputError("method", got=repr(method), expected=among, fix="Correct the name.")
