@@ -34,6 +34,10 @@ MATCHED = 0.8
 _MITTEN = 2
 """Extremities up to which a hand has no fingers: a mitten with its thumb, a fist with two knuckles."""
 
+_HELD = 0.6
+"""Share of what lies around the fingers in a hand without any that a wrap has to cover: mittens have 0.9,
+balls in place of hands 0.3, within which the fingers hang."""
+
 _OUTER = 0.3
 """Share of a digit's length from its base that may lie on its neighbour: where fingers begin is not sharp."""
 
@@ -228,7 +232,16 @@ def faults(
         for name, share in matched.items()
         if share.least < share.asked and name not in gone
     ]
-    bare = {_digit_name(limb, i) for limb in LIMBS for i in range(5) if (extremities[limb] or 0) <= _MITTEN}
+    blunt = {
+        limb: [_digit_name(limb, i) for i in range(5)]
+        for limb in LIMBS
+        if (extremities[limb] or 0) <= _MITTEN
+    }
+    for limb, names in blunt.items():
+        seen = np.mean([covered[name].native for name in names if name in covered] or [1.0])
+        if limb.endswith("Hand") and limb not in {*told, *gone} and seen < _HELD:
+            found.append(f"{limb}: no fingers stand out of the mesh, of which {1 - seen:.0%} is bare there")
+    bare = {name for names in blunt.values() for name in names}
     found += [
         f"{name}: {1 - share.wrap:.0%} is off the mesh, {1 - share.native:.0%} of the mesh there is bare"
         for name, share in covered.items()

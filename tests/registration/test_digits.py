@@ -19,7 +19,7 @@ from soma_core.registration.coverage import (
     slid,
     without_digits,
 )
-from soma_core.registration.digits import LIMBS, digit_guide
+from soma_core.registration.digits import DIGITS, LIMBS, digit_guide
 from soma_core.registration.surface import Surface
 from soma_core.registration.target import Frame, find_skin
 from soma_core.rig import load_canonical
@@ -175,4 +175,13 @@ def test_fingers_that_cannot_be_told_apart_are_refused_by_name(count, told, refu
     text = f"LeftHand: {count} fingers stand out of the mesh, not 5, so that none can be told from another"
     if count is None:
         text = "LeftHand: it touches another part of the mesh, so that no finger can be told"
+    assert said == ((text,) if refused else ())
+
+
+@pytest.mark.parametrize(("bare", "refused"), [(0.1, False), (0.7, True)])
+def test_fingers_within_a_ball_in_place_of_a_hand_are_refused(bare, refused) -> None:
+    names = [f"Left{digit}" for digit in DIGITS["Hand"]]
+    covered = {name: Share(wrap=0.4, native=1 - bare) for name in names}
+    said = faults(covered, {}, dict.fromkeys(LIMBS, 5) | {"LeftHand": 1})
+    text = f"LeftHand: no fingers stand out of the mesh, of which {bare:.0%} is bare there"
     assert said == ((text,) if refused else ())
