@@ -124,10 +124,14 @@ class BlockSkinning(torch.nn.Module):
 
     def forward(self, points: Tensor, transforms: Tensor, *, rows: bool) -> Tensor:
         """Skinned vertices: (B, v, 3) when `rows`, else planes (3, v, B); takes what ``Skinning`` does."""
-        blended = transforms.permute(0, 2, 3, 1).flatten(1, 2) @ self.weights  # all twelve numbers in one
-        place = torch.nn.functional.pad(points.permute(2, 0, 1), (0, 0, 0, 1), value=1.0)
-        skinned = (blended.unflatten(1, (3, 4)) * place[:, None]).sum(2)
+        skinned = self.planes(points.permute(2, 0, 1), transforms.permute(2, 3, 1, 0))
         return skinned.transpose(1, 2) if rows else skinned.permute(1, 2, 0)
+
+    def planes(self, points: Tensor, transforms: Tensor) -> Tensor:
+        """Skinned vertices (B, 3, v) from (B or 1, 3, v) and transforms (3, 4, J, B)."""
+        blended = transforms.permute(3, 0, 1, 2).flatten(1, 2) @ self.weights  # all twelve numbers in one
+        place = torch.nn.functional.pad(points, (0, 0, 0, 1), value=1.0)
+        return (blended.unflatten(1, (3, 4)) * place[:, None]).sum(2)
 
     def shared(self, vertices: Tensor, transforms: Tensor) -> Tensor:
         """Skin one body (v, 3) in many poses: (B, v, 3)."""

@@ -71,7 +71,7 @@ class BatchedCorrectives(torch.nn.Module):
         rank = np.arange(len(owner)) - np.searchsorted(owner, owner)  # owners are in order
         self.width = int(rank.max(initial=0)) + 1
         left, right = (each.double().cpu().numpy() for each in (given.features.left, given.features.right))
-        self.bind = keep((right @ left).transpose(0, 2, 1))  # the turns whose features are zero
+        self.bind = keep((right @ left).transpose(2, 1, 0)[..., None])  # the turns whose features are zero
 
         first = given.first.scipy().toarray().reshape(len(owner), -1, 6)[:, 1:]  # of the root they are zero
         sees = np.stack([np.abs(first[owner == joint]).sum((0, 2)) > 0 for joint in range(len(joints))])
@@ -126,20 +126,27 @@ class BatchedCorrectives(torch.nn.Module):
         self.place = keep(place.T.reshape(1, -1))
 
     def forward(self, relative: Tensor, bind_world: Tensor) -> Tensor:
-        """Offsets (B, v, 3) [m]; takes what ``Correctives`` does. Bodies stand behind joints and tiles."""
-        turns = (relative - self.bind).flatten(2).transpose(0, 1)
+        """Offsets (B, v, 3) [m]; takes what ``Correctives`` does."""
+        return self.planes(relative.permute(2, 3, 1, 0), self.scale(bind_world)).transpose(1, 2)
+
+    def planes(self, relative: Tensor, size: Tensor) -> Tensor:
+        """Offsets (B, 3, v) [m] from rotations (3, 3, J - 1, B) and sizes (B or 1,).
+
+        Bodies stand behind joints and tiles.
+        """
+        turns = (relative - self.bind).flatten(0, 1).permute(1, 2, 0)
         seen = _grouped(turns.index_select(0, self.near), len(self.excite))
         active = torch.relu(seen @ self.excite)
         if self.use_tanh:
             active = torch.tanh(active)
-        active = active * self.scale(bind_world)[:, None]
+        active = active * size[:, None]
         parts = []
         for kind in range(self.kinds):
             picks, block = getattr(self, f"picks_{kind}"), getattr(self, f"block_{kind}")
             product = _grouped(active.index_select(0, picks), len(block)) @ block
             parts.append(product.transpose(0, 1).flatten(1))
-        found = torch.cat(parts, 1).gather(1, self.place.expand(relative.shape[0], -1))
-        return found.unflatten(1, (3, -1)).transpose(1, 2)
+        found = torch.cat(parts, 1).gather(1, self.place.expand(relative.shape[3], -1))
+        return found.unflatten(1, (3, -1))
 
 
 def _grouped(rows: Tensor, groups: int) -> Tensor:

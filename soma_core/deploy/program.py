@@ -14,6 +14,7 @@ from soma_core.animation.engine import Body
 from soma_core.backends.parameters import batch_parameters
 from soma_core.choices import ModelPart
 from soma_core.deploy.blocks import without_sparse
+from soma_core.deploy.posing import ShortPosing
 from soma_core.deploy.turns import AxisAngle
 from soma_core.errors import InputError
 from soma_core.layer import SomaLayer
@@ -63,16 +64,27 @@ class _Body(torch.nn.Module):
         super().__init__()
         self.part, self.fixed, self.names, self._layer = part, dict(fixed), tuple(names), [layer]
         self.turn = AxisAngle(dtype=layer.dtype, device=layer.device)
+        self.short = (
+            ShortPosing(layer) if part is not ModelPart.joints and ShortPosing.serves(layer) else None
+        )
         with torch.no_grad():
             self.identity = None if part is ModelPart.full else layer.identity(self.fixed)
+            self.bound = None
+            if self.identity is not None and self.short is not None:
+                self.bound = self.short.bound(*layer.rest_shape(self.identity.params))
 
     def forward(self, rotations: Tensor, translation: Tensor, *values: Tensor) -> tuple[Tensor, ...]:
         layer, identity = self._layer[0], self.identity
+        if self.short is not None and self.bound is not None:
+            return self.short(self.bound, rotations, translation)
         if identity is None:
             given = self.fixed | dict(zip(self.names, values, strict=True))
             batch = rotations.shape[0]
             params = {name: value.expand(batch, *value.shape[1:]) for name, value in given.items()}
-            identity = layer._identity(params, *layer.rest_shape(params))
+            shape = layer.rest_shape(params)
+            if self.short is not None:
+                return self.short(self.short.bound(*shape), rotations, translation)
+            identity = layer._identity(params, *shape)
         vectors = rotations.permute(2, 1, 0)
         turns = self.turn.exponential(vectors.flatten(1)).view(3, 3, *vectors.shape[1:])
         body = Body(identity, turns.permute(3, 2, 0, 1), translation)

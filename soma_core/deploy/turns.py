@@ -88,22 +88,25 @@ class ShortTwist(torch.nn.Module):
     ) -> Tensor:
         """Skinning transforms (B, H, 3, 4) [m]; takes what ``Twist`` does, but no scale of bones."""
         assert bone_scale is None
+        bind = bind_world[..., :3, :].permute(2, 3, 1, 0)
+        moved = self.planes(bind[:, :3], bind[:, 3], turns.permute(2, 3, 1, 0), positions.permute(2, 1, 0))
+        return moved.permute(3, 2, 0, 1)
+
+    def planes(self, bind: Tensor, places: Tensor, turns: Tensor, positions: Tensor) -> Tensor:
+        """The same, (3, 4, H, B), of rotations (3, 3, J, B) and positions (3, J, B) in either pose."""
         count = self.helpers
-        bind = bind_world[..., :3, :].permute(2, 3, 1, 0)  # (3, 4, J, B)
-        turns = turns.permute(2, 3, 1, 0)
-        placed = (self.places @ bind_world[..., :3, 3]).permute(2, 1, 0)
+        placed = self.places @ places
         home, away, bones = placed[:, :count], placed[:, count : 2 * count], placed[:, 2 * count :]
-        angle = self.mix @ self._channels(bones, bind[:, :3], turns)  # (H, B)
-        axis = (bind[:, :3].index_select(2, self.start) * self.axis).sum(1)
+        angle = self.mix @ self._channels(bones, bind, turns)  # (H, B)
+        axis = (bind.index_select(2, self.start) * self.axis).sum(1)
         angle = angle.flatten()[None]
         shape = 3, 3, count, turns.shape[3]
         axis = axis.expand(3, *shape[2:]).flatten(1)
         spin = self.turn(axis, torch.sin(angle), 1 - torch.cos(angle)).view(shape)
         carried = turns.index_select(2, self.start)
         away = away - (spin * home).sum(1)
-        shift = (carried * away).sum(1) + positions.index_select(1, self.start).permute(2, 1, 0)
-        moved = torch.cat((product(carried, spin), shift[:, None]), 1)
-        return moved.permute(3, 2, 0, 1)
+        shift = (carried * away).sum(1) + positions.index_select(1, self.start)
+        return torch.cat((product(carried, spin), shift[:, None]), 1)
 
     def _channels(self, bones: Tensor, bind: Tensor, turns: Tensor) -> Tensor:
         """Twist angles (K, B) [rad] about segments (3, K, B)."""

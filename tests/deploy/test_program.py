@@ -96,6 +96,12 @@ def test_a_file_for_onnx_says_what_it_takes(layer, tmp_path):
     assert str(tmp_path.home()).encode() not in (tmp_path / "model.onnx").read_bytes()
 
 
+def test_a_layer_that_is_posed_by_its_own_code_gives_the_same(layer):
+    plain = SomaLayer(**layer._given | {"repose": False})
+    model = deploy(plain, params={"size": 0.9})
+    assert off_by(as_called(model.program, model), model, plain, {"size": 0.9}) < AGREES_MM
+
+
 def test_what_cannot_be_deployed_is_named(layer, tmp_path, monkeypatch):
     with pytest.raises(InputError, match="parameters: got size with what=pose, expected what=full"):
         deploy(layer, parameters=["size"])
