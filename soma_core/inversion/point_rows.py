@@ -124,8 +124,11 @@ class PointRows:
         return self._system(pose, slice(0, len(pose.translation)))[1]
 
     def _inverse(self, pose: Pose) -> tuple[Tensor, Tensor]:
-        """Matrix (F, d, d) of each frame on its own, and its inverse, float64."""
-        matrix = self.system(pose)[0].double()
+        """Matrix (F, d, d) of each frame on its own, and its inverse, float64.
+
+        Rounded to float32, exact points would outweigh all that is known of the turns they leave open.
+        """
+        matrix = self._system(pose, slice(0, len(pose.translation)), torch.float64)[1][0]
         diagonal = matrix.diagonal(dim1=-2, dim2=-1)
         ridge = _RIDGE * (diagonal + diagonal.mean(1, keepdim=True))
         factor, _ = torch.linalg.cholesky_ex(matrix + torch.diag_embed(ridge))
@@ -174,7 +177,9 @@ class PointRows:
             last_change=pose.last_change,
         )  # fmt: skip
 
-    def _system(self, pose: Pose, part: slice) -> tuple[Tensor, tuple[Tensor, Tensor]]:
+    def _system(
+        self, pose: Pose, part: slice, dtype: torch.dtype | None = None
+    ) -> tuple[Tensor, tuple[Tensor, Tensor]]:
         """Energy (F,) or (1,), and matrix (F, d, d) and slope (F, d) without what ties frames."""
         rest = self.rest
         if len(rest.local) > 1:
@@ -182,8 +187,9 @@ class PointRows:
         turns, places = self.model.walk(pose, rest)
         points = self.model.points(rest, turns, places)
         residual, slopes = self.rows(points, part)
-        jacobian = (slopes @ self.jacobian(rest, turns, places)).flatten(1, 2)
-        residual = residual.flatten(1)
+        dtype = residual.dtype if dtype is None else dtype
+        jacobian = (slopes @ self.jacobian(rest, turns, places)).flatten(1, 2).to(dtype)
+        residual = residual.flatten(1).to(dtype)
         matrix, slope = jacobian.mT @ jacobian, (jacobian * residual[..., None]).sum(1)
         energy = residual.square().sum(1) + self._expected(pose, matrix, slope)
         if self.smooth is not None:

@@ -149,6 +149,19 @@ def test_other_bodies_and_bone_lengths() -> None:
     assert without.noise > 1e-3
 
 
+def test_freedom_that_points_take_up_is_told_in_single_precision() -> None:
+    clip, taken = load_clip(), []
+    turns = torch.as_tensor(clip.rotations[::97])
+    for dtype in (torch.float32, torch.float64):
+        layer = SomaLayer("soma", lod="low", dtype=dtype)
+        model = PointInversion(layer, "soma77", kernels="torch").model
+        points = layer.joints(layer.identity(), turns.to(dtype)).joints
+        rows = point_rows.rows_of(points, points.new_ones(1, 77), 3e-4)
+        fit = point_rows.PointRows(model, model.rest(layer.identity()), rows, smooth=None)
+        taken.append(fit.taken(model.pose(turns.to(dtype), points.new_zeros(len(points), 3))).double())
+    torch.testing.assert_close(*taken, atol=0.1, rtol=0)
+
+
 def test_no_frames_are_none() -> None:
     for name in ("smpl22", "coco17"):
         inversion = PointInversion(LAYER, name)
