@@ -212,7 +212,7 @@ class _Aligner:
         if name == "Head" and not self._standing:
             return self._head(above, turn)
         if self._soles and name.endswith("ToeBase"):
-            return turn
+            return self._toes(name, turn)
         if name.endswith(trunk) and self._standing:
             return self._found["Hips"]
         if bones is None:
@@ -240,12 +240,17 @@ class _Aligner:
         return turn
 
     def _standing_foot(self, name: str) -> np.ndarray | None:
-        """From ankle to toes where a foot stands: the middle of its frames in which it is low and still.
+        """From ankle to toes where a foot stands flat; None without such frames."""
+        found = self._flat(name)
+        return None if found is None else np.array([np.cos(found[1]), -np.sin(found[1]), 0])
+
+    def _flat(self, name: str) -> tuple[np.ndarray, float] | None:
+        """Frames in which a foot is low and still, and the slope of its line there, their middle.
 
         None where these are no frames of a foot that stands flat: the direction of its bone is all there is.
         """
         toe = name.replace("Foot", "ToeBase")
-        if toe not in self._match:
+        if not {name, toe} <= set(self._match):
             return None
         positions = self._source.positions(self._turns)
         ankle, ball = positions[:, self._match[name]], positions[:, self._match[toe]]
@@ -257,7 +262,17 @@ class _Aligner:
         first, slope, last = np.quantile(slopes, (0.25, 0.5, 0.75))
         if last - first > _STEADY or not _SLOPES[0] < slope < _SLOPES[1]:
             return None
-        return np.array([np.cos(slope), -np.sin(slope), 0])
+        return still, float(slope)
+
+    def _toes(self, name: str, turn: np.ndarray) -> np.ndarray:
+        """Turn of toes: where their foot stands flat, they lie as they rest here."""
+        foot = name.replace("ToeBase", "Foot")
+        found = None if self._standing else self._flat(foot)
+        if found is None:
+            return turn
+        toes, ankles = (self._turns[found[0], self._match[each]] for each in (name, foot))
+        between = Rotation.from_matrix(np.swapaxes(toes, -1, -2) @ ankles)
+        return np.asarray(between.mean().as_matrix() @ turn)
 
     def _head(self, above: int, turn: np.ndarray) -> np.ndarray:
         """The turn by quarters that has people look ahead on average: no bone tells how a head is held."""
