@@ -6,6 +6,7 @@ Commands compose these very classes by hydra; nothing here imports it.
 from __future__ import annotations
 
 import dataclasses
+import math
 from dataclasses import dataclass, field
 from enum import StrEnum
 from os import PathLike
@@ -46,7 +47,7 @@ class Options:
     They are frozen in effect. A frozen dataclass proper is none that hydra composes upon (omegaconf 2.3).
 
     Raises:
-        InputError: another name than those of the choice, or a value of another type than the field's.
+        InputError: another name than those of the choice, a value of another type than the field's, or NaN.
     """
 
     @classmethod
@@ -78,6 +79,9 @@ class Options:
                 kinds = getattr(hint, "__name__", str(hint))
                 got = f"{value!r} ({type(value).__name__})"
                 raise InputError(name, got=got, expected=f"a value of type {kinds}", fix="Correct the value.")
+            numbers = value.values() if isinstance(value, dict) else (value,)
+            if any(isinstance(number, float) and math.isnan(number) for number in numbers):
+                raise InputError(name, got="nan", expected="a number", fix="Correct the value.")
 
 
 def _fits(value: object, hint: Any) -> bool:

@@ -11,7 +11,7 @@ import pytest
 from soma_core.choices import FitLod, Lod
 from soma_core.errors import AssetError, InputError
 from soma_core.motion import BackendChoice, ConvertOptions, IdentityChoice, InvertOptions
-from soma_core.options import ModelOptions
+from soma_core.options import AutogradChoice, ModelOptions, PriorChoice
 from soma_core.plugin.errors import BrokenBackendError
 
 
@@ -64,6 +64,8 @@ def test_what_would_change_nothing_is_refused(changes, said):
         (InvertOptions, {"chunk": 2.5}, r"chunk: got 2.5 \(float\), expected a value of type int"),
         (InvertOptions, {"chunk": True}, r"chunk: got True \(bool\)"),
         (ConvertOptions, {"fps": "abc"}, r"fps: got 'abc' \(str\)"),
+        (AutogradChoice, {"rate": float("nan")}, "rate: got nan, expected a number"),
+        (PriorChoice, {"limits": {"Head": float("nan")}}, "limits: got nan, expected a number"),
         (BackendChoice, {"name": "anny", "params": None}, r"params: got None \(NoneType\)"),
     ],
 )

@@ -70,12 +70,12 @@ class AutogradOptions:
     def __post_init__(self) -> None:
         for name in ("iterations", "rate", "shift_rate", "final"):
             value, default = getattr(self, name), type(self).__dataclass_fields__[name].default
-            if value < 0:
+            if not value >= 0:
                 raise InputError(
                     f"autograd.{name}", got=value, expected="at least 0", fix=f"Pass {name}={default}."
                 )
         for name, factor in self.regions.items():
-            if factor < 0:
+            if not factor >= 0:
                 raise InputError(
                     f"autograd.regions[{name!r}]",
                     got=factor,
