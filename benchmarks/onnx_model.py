@@ -1,7 +1,8 @@
 """Time a deployed model on one core: ``python benchmarks/onnx_model.py [--backend NAME] [--lod LOD]``.
 
-Each file is compared with the layer first. Milliseconds a frame are medians of processor time in onnxruntime;
-the layer, in the same process, stands beside them, since machines are busy.
+Each file is compared with the layer first, and with the layer in float64: two float32 results are further
+apart than each is from that. Milliseconds a frame are medians of processor time in onnxruntime; the layer, in
+the same process, stands beside them, since machines are busy.
 """
 
 from __future__ import annotations
@@ -44,9 +45,10 @@ def main() -> None:
     options = parser.parse_args()
     torch.set_num_threads(1)
     layer = SomaLayer(options.backend, lod=options.lod)
+    exact = SomaLayer(options.backend, lod=options.lod, dtype=torch.float64)
     identity = layer.identity()
-    print("| what | batch | mm from the layer | onnxruntime, ms a frame | layer, ms a frame |")
-    print("|---|---|---|---|---|")
+    print("| what | batch | mm from the layer | from float64 | onnxruntime, ms a frame | layer, ms a frame |")
+    print("|---|---|---|---|---|---|")
     for part in ModelPart:
         model = deploy(layer, part)
         with tempfile.TemporaryDirectory() as folder:
@@ -54,7 +56,10 @@ def main() -> None:
             session = open_session(Path(folder) / "model.onnx")
         for batch in (1, 7, 64):
             inputs = random_inputs(model, layer, batch, np.random.default_rng(batch))
-            distance = compare(run_session(session, inputs), inputs, layer, {})
+            found = run_session(session, inputs)
+            distance = compare(found, inputs, layer, {})
+            doubles = {name: value.double() for name, value in inputs.items()}
+            true = compare(found, doubles, exact, {})
             rotations, translation, *_ = inputs.values()
             params = {name: value for name, value in inputs.items() if name in [*model.inputs][2:]}
             calls = {
@@ -63,9 +68,8 @@ def main() -> None:
                 ModelPart.joints: lambda r=rotations, t=translation: layer.joints(identity, r, t),
             }
             ours = _median_ms(lambda s=session, i=inputs: run_session(s, i)) / batch
-            print(
-                f"| {part} | {batch} | {distance:.2g} | {ours:.2f} | {_median_ms(calls[part]) / batch:.2f} |"
-            )
+            layers = _median_ms(calls[part]) / batch
+            print(f"| {part} | {batch} | {distance:.2g} | {true:.2g} | {ours:.2f} | {layers:.2f} |")
 
 
 if __name__ == "__main__":
