@@ -18,6 +18,7 @@ from torch import Tensor
 from soma_core import PointInversion, SomaLayer
 from soma_core.evaluation.random_poses import random_axis_angles
 from soma_core.geometry.rotations import axis_angle_to_matrix
+from soma_core.motion import load_clip
 
 __all__ = ["main"]
 
@@ -70,19 +71,24 @@ def _above(joint: int, parents: np.ndarray) -> list[int]:
 
 
 def main() -> None:
-    """Fit random poses both ways, then time them in turn."""
+    """Fit poses both ways, then time them in turn."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--frames", type=int, default=4096)
     parser.add_argument("--steps", type=int, default=100, help="of Adam")
     parser.add_argument("--rate", type=float, default=0.1, help="of Adam")
     parser.add_argument("--rounds", type=int, default=5)
     parser.add_argument("--threads", type=int, default=torch.get_num_threads())
+    parser.add_argument("--motion", action="store_true", help="the shipped clip, again and again")
     options = parser.parse_args()
     torch.set_num_threads(options.threads)
     layer = SomaLayer("soma", lod="low")
     body, names = layer.identity(), list(layer.joint_names)
-    vectors = random_axis_angles(names, options.frames, np.random.default_rng(0))
-    points = layer.points(layer.joints(body, torch.as_tensor(vectors).float()), SET)
+    turns, places = random_axis_angles(names, options.frames, np.random.default_rng(0)), None
+    if options.motion:
+        clip = load_clip()
+        shown = np.arange(options.frames) % clip.frame_count
+        turns, places = clip.rotations[shown], torch.as_tensor(clip.translation[shown])
+    points = layer.points(layer.joints(body, torch.as_tensor(turns).float(), places), SET)
     inversion, adam = PointInversion(layer, SET), AdamFit(layer, options.steps, options.rate)
 
     def ours() -> Tensor:
@@ -112,7 +118,8 @@ def main() -> None:
         )
     threads = f"{options.threads} thread" + ("s" if options.threads > 1 else "")
     adams = f"Adam: {options.steps} steps, rate {options.rate}"
-    lines.append(f"\n{options.frames} random poses, {threads}; {adams}.")
+    shown = "frames of the shipped clip" if options.motion else "random poses"
+    lines.append(f"\n{options.frames} {shown}, {threads}; {adams}.")
     print("\n".join(lines))
 
 
