@@ -91,19 +91,19 @@ def read_points(
             not as many, or not as long.
     """
     size = 2 if views else 3
-    if views > 1:
-        return _of_views(path, names, person, views)
-    if path.suffix.lower() == ".csv":
-        found = _of_table(path, size)
-    elif path.is_dir() or path.suffix.lower() == ".json":
-        try:
-            found = (_of_folder if path.is_dir() else _of_json)(path, person, size)
-        except (AttributeError, IndexError, KeyError, OverflowError, TypeError, ValueError) as error:
-            if isinstance(error, SomaError):
-                raise
-            raise _no_points(path, "lists and names", "JSON", size) from error
-    else:
-        found = _of_data(path, size)
+    lists = path.is_dir() or path.suffix.lower() == ".json"
+    try:
+        if views > 1:
+            return _of_views(path, names, person, views)
+        if path.suffix.lower() == ".csv":
+            found = _of_table(path, size)
+        else:
+            found = (_of_folder if path.is_dir() else _of_json if lists else _of_data)(path, person, size)
+    except (AttributeError, IndexError, KeyError, OverflowError, TypeError, ValueError) as error:
+        if isinstance(error, SomaError):
+            raise
+        told = ("lists and names", "JSON") if lists else ("values", f"another kind ({error})")
+        raise _no_points(path, *told, size) from error
     return _ordered(path, found, names)
 
 
@@ -147,7 +147,7 @@ def _named(path: Path, file: Any, keys: Sequence[str]) -> np.ndarray:
     return file.array(known[key])
 
 
-def _of_data(path: Path, size: int) -> PointFrames:
+def _of_data(path: Path, _person: str | None, size: int) -> PointFrames:
     """Points of an NPZ, NPY, pickle or file of tensors."""
     with open_data(path) as file:
         content = file.content

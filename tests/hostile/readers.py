@@ -366,6 +366,10 @@ READERS = [
     Reader(name="pose frames", suffix=".json", read=_pose_frames, good=_pose_frame),
     Reader(name="points of a table", suffix=".csv", read=_points, good=_table),
     Reader(name="points of frames", suffix=".json", read=_points, good=_keypoints),
+    Reader(
+        name="points npy", suffix=".npy", read=_points,
+        good=lambda path: np.save(path, np.random.default_rng(0).random((2, 2, 3))),
+    ),
     Reader(name="camera of tracks", suffix=".npy", read=_camera, good=_camera_path),
     Reader(name="sam 3d body", suffix=".npz", read=read_sam3d),
     Reader(name="parquet", suffix=".parquet", read=look_through, good=_parquet, apart=True),

@@ -139,6 +139,22 @@ def test_what_is_no_points_is_refused(tmp_path: Path, values: np.ndarray, said: 
         read_points(tmp_path / "a.npz", NAMES)
 
 
+@pytest.mark.parametrize(
+    ("beside", "said"),
+    [
+        ({"points": np.array([{"a": 1}], object)}, "Python objects: a dict"),
+        ({"scores": np.zeros(7)}, "could not be broadcast"),
+        ({"scores": np.full((4, 3), "a")}, "could not convert string"),
+        ({"fps": np.zeros(0)}, "index 0 is out of bounds"),
+    ],
+)
+def test_what_is_beside_the_points_is_no_foreign_error(tmp_path: Path, beside, said: str) -> None:
+    path = tmp_path / "points.npz"
+    np.savez(path, **{"points": np.ones((4, 3, 3))} | beside)
+    with pytest.raises(InputError, match=rf"points\.npz: got values of another kind \(.*{said}"):
+        read_points(path, ("a", "b", "c"))
+
+
 def test_points_of_pictures(tmp_path: Path) -> None:
     """Arrays, tables, OpenPose's folders, COCO's results and MMPose's frames; the person of most score."""
     flat = POINTS[..., :2]
