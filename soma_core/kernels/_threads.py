@@ -22,15 +22,16 @@ _Part = TypeVar("_Part")
 _Made = TypeVar("_Made")
 
 
-def in_threads(run: Callable[[slice], None], count: int, like: Tensor) -> None:
-    """Run consecutive parts of `count` groups in as many threads as torch uses.
+def in_threads(run: Callable[[slice], None], count: int, like: Tensor, *, least: int = 1) -> None:
+    """Run consecutive parts of `count` groups, of at least so many, in as many threads as torch uses.
 
     Warp runs a CPU kernel on the calling thread and lets go of the interpreter meanwhile. On a GPU there is
     one part.
     """
     if not count:
         return
-    threads = 1 if like.is_cuda or hasattr(_own, "beside") else min(torch.get_num_threads(), count)
+    alone = like.is_cuda or hasattr(_own, "beside")
+    threads = 1 if alone else min(torch.get_num_threads(), max(1, count // least))
     parts = [slice(count * k // threads, count * (k + 1) // threads) for k in range(threads)]
     if len(parts) == 1:
         run(parts[0])

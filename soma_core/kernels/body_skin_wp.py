@@ -24,6 +24,9 @@ __all__ = ["WIDTHS", "Added", "Blend", "Strides", "blend_of", "drawing", "lanes_
 WIDTHS = {torch.float32: (4, 8, 16), torch.float64: (4, 8)}
 """Bodies a thread may treat at once: SIMD registers of current CPUs, wide ones split where there are none."""
 
+_FEW = 8
+"""Fewer bodies are not worth another thread: to launch a kernel takes as long."""
+
 _ids, _short = wp.array(dtype=wp.int32), wp.array(dtype=wp.int16)
 
 
@@ -70,12 +73,11 @@ def blend_of(matrix: scipy.sparse.csr_array, *, dtype: torch.dtype, rows: int = 
 
 @wp.struct
 class _Task:
-    """Counts and switches of one launch: groups begin .. end of bodies, tiles first .. stop of vertices."""
+    """Counts and switches of one launch: groups begin .. end of bodies, tiles of vertices."""
 
     begin: int
     end: int
-    first: int
-    stop: int
+    tiles: int
     bodies: int
     vertices: int
     joints: int
@@ -126,7 +128,7 @@ def skinning(scalar: str, lanes: int):
                 active_start, active_id, active_value, task.squashed, task.features, task.activations,
                 row(given, w), source,
             )  # fmt: skip
-            for t in range(task.first, task.stop):
+            for t in range(task.tiles):
                 a = t * size
                 b = wp.min(a + size, task.vertices)
                 if by.axis == 1 and by.vertex == 3 and by.body > 1:
@@ -264,9 +266,7 @@ def skin_bodies(
         out = points.new_empty(count, vertices, 3)
     if not out.numel():
         return out
-    lanes, tiles = lanes_of(count, points), -(-vertices // TILE)
-    groups, threads = -(-count // lanes), torch.get_num_threads()
-    shares = max(1, min(threads // groups, tiles))  # of the tiles, where there are more threads than groups
+    lanes = lanes_of(count, points)
     kernel, none = skinning(scalar_name(points.dtype), lanes), points.new_zeros(1)
     blends = skin, first or skin, *((skin, skin) if added is None else added[:2])
     frames = [none if one is None else one.contiguous() for one in (transforms, before, features)]
@@ -275,10 +275,9 @@ def skin_bodies(
     seen, moving = (0, 0) if added is None or features is None else (features.shape[1], _rows(added.first))
     sizes = 12 * joints, 12 * reposed, seen, moving, 3 * TILE
 
-    def run(part: slice) -> None:  # of more than one share, a part is one of them
-        task, share = _Task(), part.start % shares
-        task.begin, task.end = part.start // shares, -(-part.stop // shares)
-        task.first, task.stop = tiles * share // shares, tiles * (share + 1) // shares
+    def run(part: slice) -> None:
+        task = _Task()
+        task.begin, task.end, task.tiles = part.start, part.stop, -(-vertices // TILE)
         task.bodies, task.vertices, task.joints, task.reposed = count, vertices, joints, reposed
         task.features, task.activations, task.squashed = (
             seen,
@@ -292,7 +291,7 @@ def skin_bodies(
         given = start, *(as_warp(one.view(-1)) for one in frames), *map(as_rows, work), as_warp(out.view(-1))
         launch(kernel, workers, [task, strides, *tables, *given], points)
 
-    in_threads(run, groups * shares, points)
+    in_threads(run, -(-count // lanes), points)
     return out
 
 
@@ -311,6 +310,5 @@ def strides_of(points: Tensor) -> Strides:
 
 def lanes_of(count: int, like: Tensor) -> int:
     """Bodies a thread treats at once: as few as keep every thread busy, as many as a register holds."""
-    share = -(-count // torch.get_num_threads())
-    widths = WIDTHS[like.dtype]
+    share, widths = -(-count // max(1, min(torch.get_num_threads(), count // _FEW))), WIDTHS[like.dtype]
     return next((width for width in widths if width >= share), widths[-1])
