@@ -11,12 +11,15 @@ from typing import TypeVar
 import torch
 from torch import Tensor
 
-__all__ = ["in_parts", "in_threads", "shared_out", "side_by_side"]
+__all__ = ["FEW", "in_parts", "in_threads", "shared_out", "side_by_side"]
 
 _own = threading.local()
 
 _ABREAST = 16
 """Frames that lie in the lanes of one SIMD register: parts are multiples."""
+
+FEW = 8
+"""Fewer bodies to pose are not worth another thread: to launch a kernel takes as long."""
 
 _Part = TypeVar("_Part")
 _Made = TypeVar("_Made")

@@ -15,7 +15,7 @@ from soma_core.kernels._lanes import as_rows, launch, row_of, worker_count, work
 from soma_core.kernels._native import HALVES, native, transposing
 from soma_core.kernels._residual_phases import OFFSET, TILE
 from soma_core.kernels._runtime import as_warp, once, scalar_name
-from soma_core.kernels._threads import in_threads
+from soma_core.kernels._threads import FEW, in_threads
 from soma_core.kernels._view_text import TANH
 
 __all__ = ["WIDTHS", "Added", "Blend", "Strides", "blend_of", "drawing", "lanes_of", "skin_bodies",
@@ -23,9 +23,6 @@ __all__ = ["WIDTHS", "Added", "Blend", "Strides", "blend_of", "drawing", "lanes_
 
 WIDTHS = {torch.float32: (4, 8, 16), torch.float64: (4, 8)}
 """Bodies a thread may treat at once: SIMD registers of current CPUs, wide ones split where there are none."""
-
-_FEW = 8
-"""Fewer bodies are not worth another thread: to launch a kernel takes as long."""
 
 _ids, _short = wp.array(dtype=wp.int32), wp.array(dtype=wp.int16)
 
@@ -310,5 +307,5 @@ def strides_of(points: Tensor) -> Strides:
 
 def lanes_of(count: int, like: Tensor) -> int:
     """Bodies a thread treats at once: as few as keep every thread busy, as many as a register holds."""
-    share, widths = -(-count // max(1, min(torch.get_num_threads(), count // _FEW))), WIDTHS[like.dtype]
+    share, widths = -(-count // max(1, min(torch.get_num_threads(), count // FEW))), WIDTHS[like.dtype]
     return next((width for width in widths if width >= share), widths[-1])

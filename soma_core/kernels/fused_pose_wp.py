@@ -13,14 +13,13 @@ from soma_core.kernels._native import native
 from soma_core.kernels._patch_text import patch_text
 from soma_core.kernels._posing_text import body_text
 from soma_core.kernels._runtime import as_warp, launching, loaded, once, scalar_name
-from soma_core.kernels._threads import in_threads
+from soma_core.kernels._threads import FEW, in_threads
 
 __all__ = ["pose_bodies", "posing", "skin_patches"]
 
 _BODY_THREADS, _PATCH_THREADS = 256, 128
 _FEW = 8
-"""Bodies up to which each has its own blocks of skin: what counts then is to keep the device busy. Fewer are
-not worth a thread of a CPU."""
+"""Bodies up to which each has its own blocks of skin: what counts then is to keep the device busy."""
 _GROUP = {"float32": 8, "float64": 4}
 """Bodies that share one reading of the weights; as many bytes in shared memory in both precisions."""
 _WORDS = {"float32": 4, "float64": 2}
@@ -139,7 +138,7 @@ def _pose_bodies(
         with launching(rotations) as device:
             _launch(kernel, part.stop - part.start, _BODY_THREADS, [part.start, *given], device)
 
-    in_threads(run, batch, rotations, least=_FEW)
+    in_threads(run, batch, rotations, least=FEW)
     return found
 
 
